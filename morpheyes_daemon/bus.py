@@ -1,0 +1,122 @@
+"""How tasks meet: latest-value topics where the newest wins, and an event log that drops nothing.
+
+A slow reader sees the newest value and a count of what it missed; nobody ever waits for a reader.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import Any, Generic, TypeVar
+
+from morpheyes_daemon.messages import (
+    BaselineEstimate,
+    Event,
+    Governed,
+    MissionCommand,
+    Perception,
+    StereoFrame,
+    Sticks,
+    VehicleState,
+)
+
+T = TypeVar("T")
+
+
+class Latest(Generic[T]):
+    """One slot; `publish` replaces what is there and wakes whoever waits."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.count = 0
+        self._value: T | None = None
+        self._waiting: list[asyncio.Future[None]] = []
+        self._taps: list[Callable[[T], None]] = []
+
+    def publish(self, value: T) -> None:
+        """Put `value` in the slot; taps see it at once, readers when they run."""
+        self._value = value
+        self.count += 1
+        waiting, self._waiting = self._waiting, []
+        for future in waiting:
+            if not future.done():
+                future.set_result(None)
+        for tap in self._taps:
+            tap(value)
+
+    def get(self) -> T | None:
+        """Return the newest value, None before the first."""
+        return self._value
+
+    def tap(self, callback: Callable[[T], None]) -> None:
+        """Call `callback` with every value; it must be quick and must not raise."""
+        self._taps.append(callback)
+
+    def reader(self) -> Reader[T]:
+        """Return a reader that has seen nothing published so far."""
+        return Reader(self)
+
+    async def _changed(self) -> None:
+        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting.append(future)
+        await future
+
+
+class Reader(Generic[T]):
+    """One task's view of a topic: each value at most once, `dropped` counts those it was too slow for."""
+
+    def __init__(self, topic: Latest[T]) -> None:
+        self._topic = topic
+        self._seen = topic.count
+        self.dropped = 0
+
+    async def next(self) -> T:
+        """Wait for a value newer than the last one read and return the newest."""
+        while self._topic.count == self._seen:
+            await self._topic._changed()
+        self.dropped += self._topic.count - self._seen - 1
+        self._seen = self._topic.count
+        value = self._topic.get()
+        assert value is not None
+        return value
+
+
+class EventLog:
+    """Events in order; handlers are called on the spot, so that the gate hears of an edge on reception."""
+
+    def __init__(self) -> None:
+        self._handlers: list[Callable[[Event], None]] = []
+
+    def subscribe(self, handler: Callable[[Event], None]) -> None:
+        """Call `handler` for every event from now on, in order of subscription."""
+        self._handlers.append(handler)
+
+    def publish(self, event: Event) -> None:
+        """Hand the event to every handler before returning."""
+        for handler in self._handlers:
+            handler(event)
+
+
+def _topic(log_every: int, description: str) -> Any:
+    return field(metadata={"log_every": log_every, "description": description})
+
+
+@dataclass(slots=True)
+class Topics:
+    """Every topic of the daemon; `log_every` n keeps each n-th value in the flight log, 0 none."""
+
+    frame: Latest[StereoFrame] = _topic(5, "stereo frames as captured, with their baseline")
+    perception: Latest[Perception] = _topic(1, "depth summary and the strategy's percept per frame")
+    vehicle: Latest[VehicleState] = _topic(5, "attitude, velocity, mode, RC as the autopilot reports them")
+    command: Latest[MissionCommand] = _topic(1, "what the mission wants")
+    governed: Latest[Governed] = _topic(5, "speed limit and the bound that set it")
+    sticks: Latest[Sticks] = _topic(1, "stick positions offered to the gate")
+    gate: Latest[Any] = _topic(1, "what the gate let out: sticks, neutral, or released")
+    baseline: Latest[BaselineEstimate] = _topic(2, "modelled baseline")
+    health: Latest[Any] = _topic(1, "ages, rates and lateness of everything")
+
+    @classmethod
+    def create(cls) -> Topics:
+        """Return a fresh set of empty topics."""
+        return cls(**{f.name: Latest(f.name) for f in fields(cls)})

@@ -1,0 +1,1 @@
+"""Boards, solver, cross-validation, health checks and the report."""

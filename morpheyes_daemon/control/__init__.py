@@ -1,0 +1,1 @@
+"""Pure control: PID, baseline law, speed governor, velocity to sticks."""

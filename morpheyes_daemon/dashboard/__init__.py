@@ -1,0 +1,1 @@
+"""The page to watch; it reads and never commands."""

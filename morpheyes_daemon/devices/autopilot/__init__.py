@@ -1,0 +1,1 @@
+"""The autopilot link: one owner of the port, telemetry in, overrides out."""

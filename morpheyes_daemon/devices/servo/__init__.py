@@ -1,0 +1,18 @@
+"""Servo backends: each moves the two cameras to a baseline, without feedback of where they are."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Servo(Protocol):
+    """The two linear servos behind the Teensy. All verbs raise DeviceLostError or DeviceTimeoutError."""
+
+    async def open(self) -> None:
+        """Open the link and wait for the first answer; raises DeviceNotFoundError."""
+
+    async def move(self, baseline_m: float) -> None:
+        """Ask for a baseline and wait for the acknowledgement."""
+
+    async def close(self) -> None:
+        """Close; may be called twice."""

@@ -1,0 +1,54 @@
+"""One tree of errors; each message is a sentence that says what is wrong and what to do.
+
+The command line prints the message alone and exits with `exit_code`.
+"""
+
+
+class MorphEyesError(Exception):
+    """Anything a person can do something about."""
+
+    exit_code = 1
+
+
+class UsageError(MorphEyesError):
+    """Wrong arguments on the command line."""
+
+    exit_code = 2
+
+
+class ConfigError(MorphEyesError):
+    """A configuration, mission or world file says something that cannot be."""
+
+    exit_code = 2
+
+
+class InputError(MorphEyesError):
+    """An image, folder or log handed to a command cannot be used."""
+
+    exit_code = 2
+
+
+class CalibrationError(MorphEyesError):
+    """A calibration is missing, damaged, or does not cover what is asked of it."""
+
+    exit_code = 2
+
+
+class RecordingError(MorphEyesError):
+    """A flight log cannot be written or read."""
+
+
+class DeviceError(MorphEyesError):
+    """A camera, servo or autopilot link does not work."""
+
+
+class DeviceNotFoundError(DeviceError):
+    """The device cannot be opened: wrong name, unplugged, or no permission."""
+
+
+class DeviceLostError(DeviceError):
+    """The device was open and went away."""
+
+
+class DeviceTimeoutError(DeviceError):
+    """The device is there but does not answer in time."""

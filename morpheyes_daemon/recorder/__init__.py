@@ -1,0 +1,1 @@
+"""The flight log: writer, reader, recovery and the pictures made from it."""

@@ -1,0 +1,1 @@
+"""The twins: world and cameras, vehicle and autopilot, Teensy."""

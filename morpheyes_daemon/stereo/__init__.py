@@ -1,0 +1,1 @@
+"""Pure stereo geometry: rig model, rectification, matching, depth with its uncertainty."""

@@ -1,0 +1,1 @@
+"""Missions as strategies: what to make of an image, and where to fly."""

@@ -1,0 +1,1 @@
+"""The concurrent loops: wait, step, publish."""
