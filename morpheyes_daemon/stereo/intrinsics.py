@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from morpheyes_daemon.transforms import Array
 _NEWTON_STEPS = 20
 _NEWTON_TOLERANCE = 1e-13
 _ASPECT_TOLERANCE = 0.01
+_BORDER_POINTS = 33
 
 
 @dataclass(frozen=True)
@@ -83,9 +85,22 @@ class CameraIntrinsics:
             self.k,
         )
 
-    def border_pixels(self, per_side: int) -> Array:
-        """Return points (4 * per_side, 2) around the outer edge of the image, half a pixel outside the centres."""
-        s = np.linspace(0.0, 1.0, per_side)
+    @cached_property
+    def largest_radius(self) -> float:
+        """Return the undistorted normalised radius up to which the radial distortion grows; inf for most lenses."""
+        k1, k2, _, _, k5 = self.k
+        roots = np.roots([7 * k5, 5 * k2, 3 * k1, 1.0])
+        turning = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+        return math.sqrt(float(turning.min())) if turning.size else math.inf
+
+    @cached_property
+    def normalised_border(self) -> Array:
+        """Undistorted normalised coordinates (n, 2) of points around the outer edge of the image."""
+        xy = self.normalised_from_pixels(self._border_pixels())
+        return xy[np.isfinite(xy).all(axis=-1)]
+
+    def _border_pixels(self) -> Array:
+        s = np.linspace(0.0, 1.0, _BORDER_POINTS)
         left, top, right, bottom = -0.5, -0.5, self.width - 0.5, self.height - 0.5
         u, v = left + s * (right - left), top + s * (bottom - top)
         sides = [(u, np.full_like(u, top)), (u, np.full_like(u, bottom))]
