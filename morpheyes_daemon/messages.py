@@ -222,7 +222,11 @@ class Sticks:
 
 @dataclass(frozen=True, slots=True)
 class Governed:
-    """What the governor allowed at one stick period, and which bound held the speed."""
+    """What the governor allowed at one stick period, and which bound held the speed.
+
+    `stick_limit_m_s` bounds the steady speed of the stick itself: held for as long as the autopilot would fly on
+    without us, it must still leave room to stop.
+    """
 
     t_ns: int
     limit_m_s: float
@@ -231,6 +235,7 @@ class Governed:
     trust_m: float
     speed_m_s: float
     wanted_m_s: float
+    stick_limit_m_s: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,9 @@ class Stopping(Protocol):
     def stopping_distance_m(self, speed_m_s: float, height_m: float, reaction_s: float = 0.0) -> float:
         """Distance to standstill with neutral sticks after flying on for `reaction_s`."""
 
+    def time_constant_s(self, height_m: float) -> float:
+        """Time constant with which the speed of a held stick is approached."""
+
     def speed_for_distance_m(self, distance_m: float, height_m: float, reaction_s: float = 0.0) -> float:
         """Largest speed whose stopping distance fits into `distance_m`."""
 
@@ -89,7 +92,28 @@ class Governor:
         bounds = {name: value if math.isfinite(value) else 0.0 for name, value in bounds.items()}
         name = min(bounds, key=lambda key: bounds[key])
         speed = math.hypot(vehicle.v_ned_m_s[0], vehicle.v_ned_m_s[1])
-        return Governed(now_ns, bounds[name], name, seen["clear"], trust_m, speed, wanted)
+        available_m = max(0.0, min(seen.values()) - limits.standoff_m)
+        stick = self._stick_limit(speed, available_m, bounds[name], stopping, height_m)
+        return Governed(now_ns, bounds[name], name, seen["clear"], trust_m, speed, wanted, stick)
+
+    def _stick_limit(
+        self, speed_m_s: float, available_m: float, limit_m_s: float, stopping: Stopping, height_m: float
+    ) -> float:
+        """Steady speed of the strongest stick that could be held for `dead_daemon_s` and still be stopped after.
+
+        With the stick of steady speed u, v(t) = u + (v - u) e^(-t/tau); found by bisection, since v(T) and the way
+        to it both grow with u.
+        """
+        t_s, tau_s = self._limits.dead_daemon_s, stopping.time_constant_s(height_m)
+        kept = math.exp(-t_s / tau_s)
+        low, high = 0.0, max(speed_m_s, limit_m_s) / max(1.0 - kept, 0.1)
+        for _ in range(10):
+            u = (low + high) / 2
+            after = u + (speed_m_s - u) * kept
+            way = u * t_s + (speed_m_s - u) * tau_s * (1.0 - kept)
+            fits = way + stopping.stopping_distance_m(after, height_m) <= available_m and after <= limit_m_s
+            low, high = (u, high) if fits else (low, u)
+        return low
 
     def _sync_bound(self, summary: DepthSummary, command: MissionCommand) -> float:
         """Speed at which the time between the eyes costs `sync_tolerance_px` on the nearest obstacle ahead."""

@@ -1,0 +1,61 @@
+"""One stick period: the mission's command through the governor and the velocity loop to stick positions.
+
+Pure composition of `governor`, `velocity` and `loiter`; what it returns still has the gate before it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from morpheyes_daemon.control.governor import Governor
+from morpheyes_daemon.control.loiter import LoiterModel
+from morpheyes_daemon.control.velocity import VelocityController, VelocityTuning, height_above_ground_m
+from morpheyes_daemon.messages import DepthSummary, Governed, MissionCommand, Sticks, VehicleState
+
+
+class FlightControl:
+    """Holds the velocity loop; made anew when the autopilot's parameters change."""
+
+    def __init__(self, model: LoiterModel, governor: Governor, tuning: VelocityTuning) -> None:
+        self.model = model
+        self._governor = governor
+        self._velocity = VelocityController(model, tuning)
+
+    def reset(self) -> None:
+        """Forget what the loop has learned; call while the sticks are not ours."""
+        self._velocity.reset()
+
+    def step(
+        self, command: MissionCommand, summary: DepthSummary, vehicle: VehicleState, now_ns: int
+    ) -> tuple[Sticks, Governed]:
+        """Return the sticks for a command and what the governor made of its speed."""
+        height_m = height_above_ground_m(vehicle, now_ns)
+        governed = self._governor.limit(command, summary, vehicle, self.model, height_m, now_ns)
+        north, east, down = command.v_ned_m_s
+        scale = min(1.0, governed.limit_m_s / governed.wanted_m_s) if governed.wanted_m_s > 0.0 else 0.0
+        sticks = self._velocity.step(
+            now_ns, (north * scale, east * scale, down), command.yaw_rad, command.height_m, vehicle, command.coast
+        )
+        return self._reined(sticks, governed, vehicle, height_m), governed
+
+    def _reined(self, sticks: Sticks, governed: Governed, vehicle: VehicleState, height_m: float) -> Sticks:
+        """Take from the stick what would push further along the motion than the governor allows a held stick."""
+        forward, right = self.model.speed_for_sticks(sticks.roll_us, sticks.pitch_us, height_m)
+        size = math.hypot(forward, right)
+        if size <= governed.stick_limit_m_s:
+            return sticks
+        if governed.speed_m_s < 0.2:
+            along = (forward / size, right / size)
+        else:
+            cos, sin = math.cos(vehicle.yaw_rad), math.sin(vehicle.yaw_rad)
+            vx, vy, _ = vehicle.v_ned_m_s
+            along = ((cos * vx + sin * vy) / governed.speed_m_s, (cos * vy - sin * vx) / governed.speed_m_s)
+        push = forward * along[0] + right * along[1]
+        excess = push - governed.stick_limit_m_s
+        if excess <= 0.0:
+            return sticks
+        roll_us, pitch_us = self.model.sticks_for_speed(
+            forward - excess * along[0], right - excess * along[1], height_m
+        )
+        return replace(sticks, roll_us=roll_us, pitch_us=pitch_us)

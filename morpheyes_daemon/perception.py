@@ -1,0 +1,154 @@
+"""What happens to one stereo frame: rectify, match, judge the images, let the strategy look.
+
+Runs in the vision worker (another process) in real time and inline in lockstep; the same object either way.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from morpheyes_daemon.clock import stopwatch_s
+from morpheyes_daemon.config import MissionFile, VehicleConfig
+from morpheyes_daemon.messages import (
+    DepthMap,
+    DepthSummary,
+    FloatMap,
+    Image,
+    Perception,
+    StereoFrame,
+    VehicleState,
+    frozen,
+)
+from morpheyes_daemon.stereo.depth import DepthEstimator
+from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.strategies.base import Craft, Strategy, View
+from morpheyes_daemon.strategies.registry import find_strategy
+from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rpy, pose
+from morpheyes_daemon.yaml_source import validate
+
+SECTORS = 72
+"""Sectors of OBSTACLE_DISTANCE over the horizontal field of view."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VisionJob:
+    """One frame with the vehicle's state at its exposure; `keep_images` asks for the small pictures."""
+
+    frame: StereoFrame
+    vehicle: VehicleState
+    keep_images: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PipelineFactory:
+    """Builds a `Pipeline` in whichever process it is needed; picklable."""
+
+    config: VehicleConfig
+    mission: MissionFile
+    calibration: Path
+
+    def __call__(self) -> Pipeline:
+        return Pipeline(self.config, self.mission, RigModel.load(self.calibration))
+
+
+def build_craft(config: VehicleConfig) -> Craft:
+    """Return what strategies may know of the vehicle."""
+    mount = config.camera.mount
+    tilt = R_from_rpy(0.0, math.radians(mount.tilt_up_deg), 0.0)
+    position = np.array([mount.forward_mm, mount.right_mm, mount.down_mm]) / 1e3
+    return Craft(
+        footprint=config.footprint,
+        T_frd_rig=pose(tilt @ R_FRD_CAM, position),
+        baseline_range_m=config.baseline_range_m,
+        frame_period_s=1.0 / config.camera.rate_hz,
+        depth_sigmas=config.safety.depth_sigmas,
+        max_relative_depth_error=config.safety.max_relative_depth_error,
+    )
+
+
+def build_strategy(mission: MissionFile, config: VehicleConfig) -> Strategy:
+    """Return the mission's strategy with its checked parameters; raises ConfigError."""
+    kind = find_strategy(mission.strategy)
+    parameters = validate(mission.parameters, kind.Parameters, "parameters", None)
+    return kind(parameters, build_craft(config))
+
+
+class Pipeline:
+    """The image side of the daemon for one mission and one rig."""
+
+    def __init__(self, config: VehicleConfig, mission: MissionFile, rig: RigModel) -> None:
+        self._estimator = DepthEstimator(
+            rig.rescaled(config.camera.width_px, config.camera.height_px),
+            disparities_fraction=config.stereo.disparities_fraction,
+            sigma_disparity_px=config.stereo.sigma_disparity_px,
+        )
+        self._strategy = build_strategy(mission, config)
+        self._T_frd_rig = build_craft(config).T_frd_rig
+
+    def perceive(self, job: VisionJob) -> Perception:
+        """Return what one frame shows. Raises CalibrationError when the rig does not cover the frame's baseline."""
+        started_s = stopwatch_s()
+        estimate = self._estimator.estimate(job.frame)
+        depth = estimate.depth
+        view = View(depth, estimate.left, estimate.right, job.vehicle, self._T_frd_rig)
+        percept = self._strategy.perceive(view)
+        return Perception(
+            summary=summarize(depth, stopwatch_s() - started_s),
+            percept=percept,
+            sectors_m=sectors(depth),
+            image_faults=estimate.faults,
+            left_rect=_small(estimate.left_colour) if job.keep_images else None,
+            depth_m=frozen(depth.depth_m[::2, ::2].copy()) if job.keep_images else None,
+        )
+
+
+def summarize(depth: DepthMap, compute_s: float) -> DepthSummary:
+    """Return the summary of a depth map; `done_ns` is set by the task that receives it."""
+    known = depth.depth_m[np.isfinite(depth.depth_m)]
+    return DepthSummary(
+        seq=depth.seq,
+        t_ns=depth.t_ns,
+        done_ns=depth.t_ns,
+        baseline_m=depth.baseline_m,
+        baseline_sigma_m=depth.baseline_sigma_m,
+        f_px=depth.pinhole.f_px,
+        h_fov_rad=depth.pinhole.h_fov_rad,
+        sigma_disparity_px=depth.sigma_disparity_px,
+        near_limit_m=depth.near_limit_m,
+        valid_fraction=depth.valid_fraction,
+        ceiling_fraction=depth.ceiling_fraction,
+        nearest_m=float(np.percentile(known, 1.0)) if known.size else math.nan,
+        compute_s=compute_s,
+        calibration_hash=depth.calibration_hash,
+    )
+
+
+def sectors(depth: DepthMap) -> FloatMap:
+    """Return (72,) the nearest depth per sector of the view in the middle third of the rows, NaN where none.
+
+    Sectors are equal in angle. Pixels at the disparity ceiling count as the near limit.
+    """
+    height = depth.depth_m.shape[0]
+    rows = slice(height // 3, 2 * height // 3)
+    middle = np.where(depth.near[rows], np.float32(depth.near_limit_m), depth.depth_m[rows])
+    filled = np.where(np.isfinite(middle), middle, np.inf)
+    columns = np.partition(filled, 4, axis=0)[4]
+    pinhole = depth.pinhole
+    angle = np.arctan((np.arange(pinhole.width) - pinhole.cx_px) / pinhole.f_px)
+    left = -math.atan((pinhole.cx_px + 0.5) / pinhole.f_px)
+    index = np.clip(((angle - left) / pinhole.h_fov_rad * SECTORS).astype(np.int64), 0, SECTORS - 1)
+    nearest = np.full(SECTORS, np.inf)
+    np.minimum.at(nearest, index, columns / np.cos(angle))
+    return frozen(np.where(np.isfinite(nearest), nearest, np.nan).astype(np.float32))
+
+
+def _small(image: Image) -> Image:
+    scale = 320 / image.shape[1]
+    if scale >= 1.0:
+        return frozen(image.copy())
+    return frozen(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8))

@@ -1,0 +1,307 @@
+"""Forest flight: to the goal between the trees (paper, section V-A, with paper-notes 4 to 11).
+
+The free direction v_free and the goal direction v_g are weighted by how close the nearest obstacle of the corridor
+is; a PID turns the velocity towards the result; the vehicle stops where the corridor closes within tau_safe, looks
+around by yaw, and goes on towards free space. The baseline follows K Z_close. How fast it goes is the governor's.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from morpheyes_daemon.clock import S
+from morpheyes_daemon.config import Section
+from morpheyes_daemon.control.baseline import baseline_for
+from morpheyes_daemon.control.pid import Pid, PidGains
+from morpheyes_daemon.messages import Intent, MissionCommand, VehicleState
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, StrategyParameters, View
+from morpheyes_daemon.strategies.corridor import free_distance_m
+from morpheyes_daemon.strategies.memory import ObstacleMemory
+from morpheyes_daemon.strategies.profile import Floats, ObstacleProfile, obstacle_profile
+from morpheyes_daemon.transforms import wrap_rad
+
+
+class Goal(Section):
+    """Where to go, from where and in the heading in which the mission engaged."""
+
+    forward_m: float = Field(80.0, ge=-10000, le=10000)
+    right_m: float = Field(0.0, ge=-10000, le=10000)
+
+
+class ForestParameters(StrategyParameters):
+    """What `parameters:` of a forest mission may say."""
+
+    goal: Goal = Goal()
+    goal_radius_m: float = Field(1.5, gt=0.2, le=20, description="the goal counts as reached within this")
+    height_m: float | None = Field(None, gt=0.3, le=20, description="None: the height at which it engaged")
+    speed_m_s: float = Field(4.0, gt=0.1, le=10, description="never wanted faster; the governor is the real bound")
+    baseline_gain: float = Field(0.04, gt=0, le=1, description="K of b = K Z_close")
+    baseline_smoothing_s: float = Field(0.5, ge=0, le=10, description="time constant of the low-passed Z_close")
+    margin_m: float = Field(0.30, ge=0, le=3, description="room kept to obstacles on each side")
+    tight_margin_m: float = Field(0.15, ge=0, le=3, description="room kept where nothing wider is free")
+    band_margin_m: float = Field(0.20, ge=0, le=3, description="room kept above and below")
+    safe_m: float = Field(0.4, ge=0, le=10, description="tau_safe: stop when the corridor closes within this")
+    memory_s: float = Field(6.0, ge=0, le=60, description="how long obstacles out of view are remembered")
+    reach_m: float = Field(16.0, gt=1, le=100, description="how far ahead directions are compared")
+    weight: Literal["stopping", "paper"] | float = Field(
+        "stopping", description="Z_0 of the weight: twice the stopping distance, the paper's printed form, or metres"
+    )
+    turn_gains: tuple[float, float, float] = Field((1.2, 0.0, 0.05), description="kp, ki, kd on the heading error")
+    look_rate_deg_s: float = Field(35.0, gt=1, le=90, description="yaw rate when looking around")
+
+
+class Phase(StrEnum):
+    """What the decider is doing."""
+
+    FLY = "fly"
+    LOOK = "look"
+    DONE = "done"
+
+
+class Forest(Strategy):
+    """See the module."""
+
+    Parameters = ForestParameters
+    parameters: ForestParameters
+
+    def __init__(self, parameters: ForestParameters, craft: Craft) -> None:
+        super().__init__(parameters, craft)
+        self._memory = ObstacleMemory(max(parameters.memory_s, 10 * craft.frame_period_s))
+        self._turn = Pid(PidGains(*parameters.turn_gains))
+        self._goal_ned_m: tuple[float, float] | None = None
+        self._height_m = parameters.height_m
+        self._phase = Phase.FLY
+        self._z_close_m = math.nan
+        self._last_ns = 0
+        self._heading_rad = 0.0
+        self._look_sign = 1.0
+        self._looked_rad = 0.0
+        self._seq = 0
+
+    def perceive(self, view: View) -> ObstacleProfile:
+        """Return the obstacle profile at flying height, as far as the depth is believed."""
+        depth = view.depth
+        share = self.craft.max_relative_depth_error / self.craft.depth_sigmas
+        trust_m = depth.baseline_m * depth.pinhole.f_px / depth.sigma_disparity_px * share
+        band_m = self.craft.footprint.hull_height_mm / 2e3 + self.parameters.band_margin_m
+        return obstacle_profile(view, band_m, trust_m)
+
+    def decide(self, observation: Observation) -> MissionCommand:
+        """Return velocity, heading and baseline until the next frame."""
+        profile: ObstacleProfile = observation.percept
+        vehicle = observation.vehicle
+        self._memory.add(profile)
+        if not observation.engaged:
+            self._settle(vehicle)
+        dt_s = min(2.0, max(1e-3, (observation.now_ns - self._last_ns) / S)) if self._last_ns else 0.2
+        self._last_ns = observation.now_ns
+        assert self._goal_ned_m is not None
+        to_goal = (self._goal_ned_m[0] - vehicle.p_ned_m[0], self._goal_ned_m[1] - vehicle.p_ned_m[1])
+        distance_m = math.hypot(*to_goal)
+        if self._phase is Phase.DONE or distance_m < self.parameters.goal_radius_m:
+            self._phase = Phase.DONE
+            return self._stop(observation, Intent.DONE, Reason.GOAL_REACHED)
+        obstacles = self._obstacles(profile, observation)
+        goal_rad = math.atan2(to_goal[1], to_goal[0])
+        choice = self._choose(profile, obstacles, observation, goal_rad, distance_m)
+        if choice is None:
+            return self._look(profile, observation, goal_rad, dt_s)
+        return self._fly(choice, obstacles, observation, dt_s, distance_m)
+
+    def _settle(self, vehicle: VehicleState) -> None:
+        """Before the mission engages: the goal and the height follow the vehicle."""
+        goal = self.parameters.goal
+        cos, sin = math.cos(vehicle.yaw_rad), math.sin(vehicle.yaw_rad)
+        self._goal_ned_m = (
+            vehicle.p_ned_m[0] + goal.forward_m * cos - goal.right_m * sin,
+            vehicle.p_ned_m[1] + goal.forward_m * sin + goal.right_m * cos,
+        )
+        self._heading_rad = vehicle.yaw_rad
+        self._phase = Phase.FLY
+        if self.parameters.height_m is None:
+            self._height_m = vehicle.height_m if math.isfinite(vehicle.height_m) else -vehicle.p_ned_m[2]
+
+    def _obstacles(self, profile: ObstacleProfile, observation: Observation) -> Floats:
+        """Every known obstacle point (N, 2) relative to the vehicle; what is unknown for long counts as one."""
+        points = [self._memory.points_ned_m]
+        bins = np.nonzero(_wide(profile.unknown))[0]
+        if bins.size:
+            remembered = self._memory.nearest_along(profile)[bins]
+            ranges = np.where(np.isfinite(remembered), remembered, 2.0)
+            angle = profile.azimuth_rad[bins]
+            x = profile.origin_ned_m[0] + ranges * np.cos(angle)
+            y = profile.origin_ned_m[1] + ranges * np.sin(angle)
+            points.append(np.stack([x, y], axis=1))
+        return np.concatenate(points) - np.array(observation.vehicle.p_ned_m[:2])
+
+    def _half_width_m(self, margin_m: float, baseline_m: float) -> float:
+        return self.craft.footprint.width_m(baseline_m) / 2 + margin_m
+
+    def _choose(
+        self,
+        profile: ObstacleProfile,
+        obstacles: Floats,
+        observation: Observation,
+        goal_rad: float,
+        distance_m: float,
+    ) -> tuple[float, float, float] | None:
+        """Return (heading, corridor half width, Z_close along it), or None when nothing in view is free."""
+        parameters = self.parameters
+        reach = min(parameters.reach_m, profile.trust_m)
+        headings = profile.azimuth_rad[3:-3]
+        need = max(parameters.safe_m, min(observation.reserve_m, reach * 0.6))
+        for margin_m in (parameters.margin_m, parameters.tight_margin_m):
+            half_width = self._half_width_m(margin_m, observation.baseline_m)
+            free = free_distance_m(obstacles, headings, half_width, reach)
+            if free.max() >= parameters.safe_m + 0.6:
+                break
+        else:
+            return None
+        clipped_goal = _clip(goal_rad, headings)
+        capped = np.minimum(free, max(distance_m, 1.0))
+        off_goal = np.abs(_wrapped(headings - goal_rad))
+        off_course = np.abs(_wrapped(headings - self._heading_rad))
+        progress = capped * np.cos(np.minimum(off_goal, math.pi / 2) * 0.8) - 0.8 * off_course - 0.5 * off_goal
+        free_rad = float(headings[int(np.argmax(np.where(free >= parameters.safe_m, progress, -np.inf)))])
+        z_goal = float(free_distance_m(obstacles, np.array([clipped_goal]), half_width, reach)[0])
+        weight = self._weight(z_goal, observation.reserve_m) if z_goal < min(reach, distance_m) else 0.0
+        heading = clipped_goal + weight * wrap_rad(free_rad - clipped_goal)
+        z_close = float(free_distance_m(obstacles, np.array([heading]), half_width, reach)[0])
+        best = float(free_distance_m(obstacles, np.array([free_rad]), half_width, reach)[0])
+        if z_close < min(need, best):
+            heading, z_close = free_rad, best
+        return heading, half_width, z_close
+
+    def _weight(self, z_close_m: float, reserve_m: float) -> float:
+        """Weight of the free direction, 0 (far) to 1 (close); paper-notes 5."""
+        rule = self.parameters.weight
+        if rule == "paper":
+            return 1.0 / (1.0 + math.exp(-1.0 / max(z_close_m, 1e-3)))
+        z0_m = max(2.0 * reserve_m, 4.0) if rule == "stopping" else float(rule)
+        return math.tanh(z0_m / (2.0 * max(z_close_m, 1e-3)))
+
+    def _fly(
+        self,
+        choice: tuple[float, float, float],
+        obstacles: Floats,
+        observation: Observation,
+        dt_s: float,
+        distance_m: float,
+    ) -> MissionCommand:
+        heading, half_width, z_close = choice
+        vehicle = observation.vehicle
+        self._phase = Phase.FLY
+        self._looked_rad = 0.0
+        vx, vy, _ = vehicle.v_ned_m_s
+        speed = math.hypot(vx, vy)
+        course = math.atan2(vy, vx) if speed > 0.5 else heading
+        turn = self._turn.step(wrap_rad(heading - course), dt_s, low=-0.9, high=0.9)
+        command_rad = course + turn if speed > 0.5 else heading
+        slim = self._half_width_m(self.parameters.tight_margin_m * 0.5, observation.baseline_m)
+        reach = self.parameters.reach_m
+        drift = float(free_distance_m(obstacles, np.array([course]), slim, reach)[0]) if speed > 0.5 else reach
+        clear = min(z_close, drift)
+        wanted = min(self.parameters.speed_m_s, 0.3 + 0.8 * distance_m)
+        facing = math.cos(min(math.pi / 2, 1.5 * abs(wrap_rad(heading - vehicle.yaw_rad))))
+        wanted *= max(0.15, facing)
+        self._heading_rad = heading
+        self._follow(z_close, dt_s)
+        return self._command(
+            observation,
+            Intent.FLY,
+            None,
+            (wanted * math.cos(command_rad), wanted * math.sin(command_rad), 0.0),
+            heading,
+            clear,
+            z_close,
+            {"heading_rad": heading, "drift_m": drift, "half_width_m": half_width},
+        )
+
+    def _look(
+        self, profile: ObstacleProfile, observation: Observation, goal_rad: float, dt_s: float
+    ) -> MissionCommand:
+        """Nothing in view is free: stand still and turn until something is."""
+        if self._phase is not Phase.LOOK:
+            self._phase = Phase.LOOK
+            left, right = np.array_split(np.minimum(profile.range_m, profile.trust_m), 2)
+            self._look_sign = 1.0 if float(right.mean()) >= float(left.mean()) else -1.0
+            self._looked_rad = 0.0
+        turn = math.radians(self.parameters.look_rate_deg_s)
+        self._looked_rad += turn * dt_s
+        self._heading_rad = observation.vehicle.yaw_rad
+        self._follow(profile.near_limit_m, dt_s)
+        yaw_rad = wrap_rad(observation.vehicle.yaw_rad + self._look_sign * min(1.0, turn * 1.0))
+        return self._command(
+            observation, Intent.STOP, Reason.NO_FREE_PATH, (0.0, 0.0, 0.0), yaw_rad, 0.0, self._z_close_m, {}
+        )
+
+    def _stop(self, observation: Observation, intent: Intent, reason: Reason) -> MissionCommand:
+        return self._command(observation, intent, reason, (0.0, 0.0, 0.0), None, 0.0, self._z_close_m, {})
+
+    def _follow(self, z_close_m: float, dt_s: float) -> None:
+        """Low-pass Z_close; it falls at once (the near blind zone is the danger) and rises slowly."""
+        smoothing = self.parameters.baseline_smoothing_s
+        if math.isnan(self._z_close_m) or smoothing <= 0.0:
+            self._z_close_m = z_close_m
+        else:
+            self._z_close_m += (z_close_m - self._z_close_m) * (1.0 - math.exp(-dt_s / smoothing))
+
+    def _command(
+        self,
+        observation: Observation,
+        intent: Intent,
+        reason: Reason | None,
+        v_ned_m_s: tuple[float, float, float],
+        yaw_rad: float | None,
+        clear_m: float,
+        z_close_m: float,
+        detail: dict[str, float],
+    ) -> MissionCommand:
+        self._seq += 1
+        return MissionCommand(
+            seq=self._seq,
+            t_ns=observation.now_ns,
+            expires_ns=observation.now_ns + round(3 * self.craft.frame_period_s * S),
+            intent=intent,
+            reason=reason,
+            v_ned_m_s=v_ned_m_s,
+            yaw_rad=yaw_rad,
+            height_m=self._height_m,
+            baseline_m=baseline_for(self._z_close_m, self.parameters.baseline_gain, self.craft.baseline_range_m),
+            clear_m=clear_m,
+            measured_ns=observation.vehicle.position_t_ns,
+            p_measured_ned_m=observation.vehicle.p_ned_m,
+            z_close_m=z_close_m,
+            detail=detail,
+        )
+
+
+def _wide(flags: np.ndarray[tuple[int], np.dtype[np.bool_]], least: int = 3) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Keep runs of at least `least` set bins; thinner ones lie between two that are known."""
+    kept = np.zeros_like(flags)
+    start = None
+    for i, flag in enumerate([*flags, False]):
+        if flag and start is None:
+            start = i
+        elif not flag and start is not None:
+            if i - start >= least:
+                kept[start:i] = True
+            start = None
+    return kept
+
+
+def _wrapped(angle_rad: Floats) -> Floats:
+    return np.asarray((angle_rad + math.pi) % (2 * math.pi) - math.pi)
+
+
+def _clip(goal_rad: float, headings: Floats) -> float:
+    """The goal direction, or the edge of the view nearest to it."""
+    middle = float(headings[len(headings) // 2])
+    half = float(headings[-1] - headings[0]) / 2
+    return middle + max(-half, min(half, wrap_rad(goal_rad - middle)))

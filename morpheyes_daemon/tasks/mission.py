@@ -1,0 +1,68 @@
+"""Percepts to mission commands."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+from morpheyes_daemon.bus import Topics
+from morpheyes_daemon.clock import Clock
+from morpheyes_daemon.control.governor import Stopping
+from morpheyes_daemon.control.vehicle_track import VehicleTrack
+from morpheyes_daemon.messages import Intent, Perception
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.safety.gate import Lease
+from morpheyes_daemon.safety.guardian import Guardian
+from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.strategies.base import Observation, Strategy
+from morpheyes_daemon.supervisor.supervisor import Pulse
+
+
+class StoppingSource(Protocol):
+    """Knows the vehicle's braking once the autopilot's parameters have been read."""
+
+    @property
+    def stopping(self) -> Stopping | None:
+        """The stopping model, None before the parameters are known."""
+
+
+def observe(
+    seen: Perception, track: VehicleTrack, vehicle: StoppingSource, guardian: Guardian, now_ns: int, reaction_s: float
+) -> Observation:
+    """Put together what the strategy gets."""
+    present = track.now(now_ns)
+    speed = math.hypot(present.v_ned_m_s[0], present.v_ned_m_s[1])
+    height_m = present.height_m if math.isfinite(present.height_m) else -present.p_ned_m[2]
+    stopping = vehicle.stopping
+    return Observation(
+        now_ns=now_ns,
+        percept=seen.percept,
+        summary=seen.summary,
+        vehicle=present,
+        at_exposure=track.at(seen.summary.t_ns),
+        baseline_m=seen.summary.baseline_m,
+        reserve_m=stopping.stopping_distance_m(speed, height_m, reaction_s) if stopping else math.inf,
+        engaged=guardian.state is State.ENGAGED,
+    )
+
+
+async def mission(
+    strategy: Strategy,
+    track: VehicleTrack,
+    vehicle: StoppingSource,
+    guardian: Guardian,
+    topics: Topics,
+    clock: Clock,
+    reaction_s: float,
+    pulse: Pulse,
+) -> None:
+    """Let the strategy decide on every percept; done or refused ends the flight in HOLD."""
+    percepts = topics.perception.reader()
+    while True:
+        seen = await percepts.next()
+        command = strategy.decide(observe(seen, track, vehicle, guardian, clock.now_ns(), reaction_s))
+        topics.command.publish(command)
+        guardian.gate.renew(Lease.MISSION, command.expires_ns)
+        if command.intent in (Intent.DONE, Intent.REFUSE):
+            guardian.mission_over(command.reason or Reason.GOAL_REACHED, clock.now_ns())
+        pulse.beat()
