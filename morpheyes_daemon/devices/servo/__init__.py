@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from morpheyes_daemon.bus import EventLog
+from morpheyes_daemon.clock import Clock
+from morpheyes_daemon.config import NoServoConfig, ServoConfig
+from morpheyes_daemon.devices.link import LinkOpener
+
 
 class Servo(Protocol):
     """The two linear servos behind the Teensy. All verbs raise DeviceLostError or DeviceTimeoutError."""
@@ -16,3 +21,21 @@ class Servo(Protocol):
 
     async def close(self) -> None:
         """Close; may be called twice."""
+
+
+def build_servo(config: ServoConfig, opener: LinkOpener, clock: Clock, events: EventLog) -> Servo:
+    """Return the configured backend, not yet open; losses and recoveries go to `events`."""
+    if isinstance(config, NoServoConfig):
+        from morpheyes_daemon.devices.servo.none import NoServo
+
+        return NoServo(config.baseline_mm / 1e3)
+    from morpheyes_daemon.devices.servo.serial import SerialServo
+
+    return SerialServo(config.url, config.motion, opener, clock, events)
+
+
+async def open_servo(config: ServoConfig, opener: LinkOpener, clock: Clock, events: EventLog) -> Servo:
+    """Return the configured backend, open; raises DeviceNotFoundError and leaves nothing behind."""
+    servo = build_servo(config, opener, clock, events)
+    await servo.open()
+    return servo
