@@ -72,6 +72,11 @@ def _sentence(problem: dict[str, Any], name: str, root: yaml.Node | None) -> str
     return f"{where}: {key}: found {found}; {allowed}."
 
 
+def line_of(root: yaml.Node | None, *keys: str) -> int | None:
+    """Return the line on which a nested key stands, or of the nearest one above it."""
+    return _find(list(keys), root)[1]
+
+
 def _find(location: list[str], root: yaml.Node | None) -> tuple[list[str], int | None]:
     """Follow `location` into the node tree; discriminator tags in it are no keys and are passed over."""
     node, keys = root, []

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.metadata import entry_points
+from pathlib import Path
 
+import yaml
+from pydantic import BaseModel, create_model
+
+from morpheyes_daemon.config import MissionFile
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.strategies.base import Strategy
+from morpheyes_daemon.strategies.base import Strategy, StrategyParameters
+from morpheyes_daemon.yaml_source import line_of, read_text, validate
 
 BUILT_IN = {
     "forest": "morpheyes_daemon.strategies.forest:Forest",
@@ -34,3 +40,19 @@ def find_strategy(name: str) -> type[Strategy]:
     if not (isinstance(found, type) and issubclass(found, Strategy)):
         raise ConfigError(f"the strategy {name!r} is not a subclass of morpheyes_daemon.strategies.base.Strategy.")
     return found
+
+
+def check_mission(path: Path, mission: MissionFile) -> MissionFile:
+    """Return the mission when its strategy exists and takes its parameters; raises ConfigError naming the line."""
+    root = yaml.compose(read_text(path), Loader=yaml.SafeLoader)
+    try:
+        kind = find_strategy(mission.strategy)
+    except ConfigError as error:
+        raise ConfigError(f"{path}:{line_of(root, 'strategy')}: strategy: {error}") from None
+    validate({"parameters": mission.parameters}, _wrapped(kind.Parameters), str(path), root)
+    return mission
+
+
+def _wrapped(parameters: type[StrategyParameters]) -> type[BaseModel]:
+    """A model with one key `parameters`, so that errors name the lines of the mission file."""
+    return create_model("Parameters", parameters=(parameters, ...))
