@@ -1,0 +1,225 @@
+"""Calibration boards: what they look like, where their corners are, and finding those corners in an image.
+
+Chessboards and ChArUco boards. Corners come back in the board's own order, which for a chessboard seen alone is
+known only up to a turn of the board; `aligned` settles it between the two eyes, and that is all a stereo solve
+needs. How the squares are measured is the person's business: no picture can tell the size of a square.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morpheyes_daemon.errors import InputError, UsageError
+from morpheyes_daemon.messages import Image
+from morpheyes_daemon.transforms import Array
+
+_WINDOW_SHARE = 0.42
+"""Half width of the sub-pixel window as a share of the distance to the nearest corner: the next edge stays out."""
+_WINDOW_LIMITS_PX = (2, 11)
+_REFINE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
+_SQUARE_LIMITS_M = (0.001, 1.0)
+_MARKER_SHARE = 0.75
+"""Marker side over square side of a ChArUco board when the person does not say."""
+_FEWEST_CHARUCO_CORNERS = 8
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat board: `columns` x `rows` inner corners, `square_m` apart.
+
+    A ChArUco board of (columns + 1) x (rows + 1) squares has the same inner corners; `dictionary` and
+    `marker_share` (marker side over square side) say which markers sit in its white squares.
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+    kind: Literal["chessboard", "charuco"] = "chessboard"
+    dictionary: str = "5X5_1000"
+    marker_share: float = _MARKER_SHARE
+
+    def __post_init__(self) -> None:
+        low, high = _SQUARE_LIMITS_M
+        if not 3 <= min(self.columns, self.rows) or max(self.columns, self.rows) > 60:
+            raise UsageError(f"A board of {self.columns}x{self.rows} inner corners cannot be used; give 3 to 60 each.")
+        if not (math.isfinite(self.square_m) and low <= self.square_m <= high):
+            raise UsageError(
+                f"A square of {self.square_m * 1e3:g} mm is not believable; "
+                f"measure one on the board and give 1 to 1000 mm."
+            )
+        if self.kind == "charuco" and not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
+            raise UsageError(f"There is no marker dictionary {self.dictionary!r}; use one such as 4X4_50 or 5X5_1000.")
+
+    @property
+    def corner_count(self) -> int:
+        """Number of inner corners."""
+        return self.columns * self.rows
+
+    @property
+    def points_m(self) -> Array:
+        """Inner corners (columns * rows, 3) in the board's frame, row by row, z = 0."""
+        v, u = np.mgrid[0 : self.rows, 0 : self.columns]
+        flat = np.stack([u.ravel(), v.ravel(), np.zeros(u.size)], axis=-1)
+        return np.asarray(flat * self.square_m, dtype=np.float64)
+
+    @property
+    def label(self) -> str:
+        """The board as `--board` takes it."""
+        if self.kind == "charuco":
+            return f"charuco:{self.columns + 1}x{self.rows + 1}:{self.dictionary}"
+        return f"{self.columns}x{self.rows}"
+
+
+def parse_board(text: str, square_m: float, marker_m: float | None = None) -> Board:
+    """Return the board of `9x6` (inner corners) or `charuco:10x7[:5X5_1000]` (squares); raises UsageError."""
+    match = re.fullmatch(r"(?:(charuco):)?(\d+)x(\d+)(?::(\w+))?", text.strip())
+    if not match or (match[4] and not match[1]):
+        raise UsageError(
+            f"The board {text!r} is not understood; give the inner corners such as 9x6, or charuco:10x7:5X5_1000."
+        )
+    columns, rows = int(match[2]), int(match[3])
+    if not match[1]:
+        return Board(columns, rows, square_m)
+    share = _MARKER_SHARE if marker_m is None else marker_m / square_m
+    if not 0.2 < share < 1.0:
+        raise UsageError(f"A marker must be smaller than its square, not {share:.2f} of it; measure both.")
+    return Board(columns - 1, rows - 1, square_m, "charuco", (match[4] or "5X5_1000").upper(), share)
+
+
+def grey(image: Image) -> Image:
+    """Return an image (H, W) or (H, W, 3) BGR as grey (H, W)."""
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+
+def find_corners(image: Image, board: Board) -> Array | None:
+    """Return the inner corners (columns * rows, 2) in pixels, NaN where unseen, or None without a board.
+
+    A chessboard is found whole or not at all; a ChArUco board may be partly outside or hidden.
+    """
+    picture = grey(image)
+    return _find_charuco(picture, board) if board.kind == "charuco" else _find_chessboard(picture, board)
+
+
+def aligned(left: Array, right: Array, board: Board) -> Array:
+    """Return the right eye's chessboard corners in the left eye's order.
+
+    The eyes look the same way up, so of the board's possible turns the one whose corner grid points the same way
+    in both images is meant. ChArUco corners carry their numbers and need none of this.
+    """
+    if board.kind == "charuco":
+        return right
+    turns = _turns(right, board)
+    axes = [_axis(turn, board) for turn in turns]
+    wanted = _axis(left, board)
+    return turns[int(np.argmax([axis @ wanted for axis in axes]))]
+
+
+def draw_board(board: Board, pixels_per_square: int, margin_squares: float = 1.0) -> tuple[Image, Array]:
+    """Return a picture of the board (H, W) and the pixel of every inner corner (columns * rows, 2) in it.
+
+    The margin is white paper. Used for rendering and for printing.
+    """
+    margin = round(margin_squares * pixels_per_square)
+    columns, rows = board.columns + 1, board.rows + 1
+    size = (columns * pixels_per_square, rows * pixels_per_square)
+    if board.kind == "charuco":
+        inner = np.asarray(_charuco(board).generateImage(size), dtype=np.uint8)
+    else:
+        dark = np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0
+        inner = np.where(np.kron(dark, np.ones((pixels_per_square,) * 2)), 0, 255).astype(np.uint8)
+    picture = np.pad(inner, margin, constant_values=255)
+    corners = (board.points_m[:, :2] / board.square_m + 1.0) * pixels_per_square + margin - 0.5
+    return picture, corners
+
+
+def _find_chessboard(picture: Image, board: Board) -> Array | None:
+    size = (board.columns, board.rows)
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
+    if not found:
+        found, corners = cv2.findChessboardCornersSB(picture, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not found:
+        return None
+    return _right_handed(_refined(picture, corners.reshape(-1, 2).astype(np.float64), board), board)
+
+
+def _find_charuco(picture: Image, board: Board) -> Array | None:
+    detector = cv2.aruco.CharucoDetector(_charuco(board))
+    corners, numbers, _, _ = detector.detectBoard(picture)
+    if numbers is None or len(numbers) < _FEWEST_CHARUCO_CORNERS:
+        return None
+    found = np.full((board.corner_count, 2), np.nan)
+    found[numbers.ravel()] = corners.reshape(-1, 2)
+    return _refined(picture, found, board)
+
+
+def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{board.dictionary}"))
+    squares = (board.columns + 1, board.rows + 1)
+    return cv2.aruco.CharucoBoard(squares, board.square_m, board.square_m * board.marker_share, dictionary)
+
+
+def _refined(picture: Image, corners: Array, board: Board) -> Array:
+    """Move each corner to its saddle point, in a window as wide as its neighbours allow."""
+    half = np.clip(np.round(_WINDOW_SHARE * _spacing(corners, board)), *_WINDOW_LIMITS_PX)
+    refined = corners.copy()
+    for window in np.unique(half[np.isfinite(half)]):
+        chosen = half == window
+        start = corners[chosen].astype(np.float32).reshape(-1, 1, 2)
+        moved = cv2.cornerSubPix(picture, start, (int(window), int(window)), (-1, -1), _REFINE)
+        refined[chosen] = moved.reshape(-1, 2)
+    return refined
+
+
+def _spacing(corners: Array, board: Board) -> Array:
+    """Return the distance (n,) of each corner to its nearest neighbour on the grid; NaN for an unseen corner."""
+    grid = corners.reshape(board.rows, board.columns, 2)
+    nearest = np.full(grid.shape[:2], np.inf)
+    for axis in (0, 1):
+        gap = np.linalg.norm(np.diff(grid, axis=axis), axis=-1)
+        gap = np.where(np.isfinite(gap), gap, np.inf)
+        before, after = (nearest[1:], nearest[:-1]) if axis == 0 else (nearest[:, 1:], nearest[:, :-1])
+        np.minimum(before, gap, out=before)
+        np.minimum(after, gap, out=after)
+    nearest[~np.isfinite(grid[..., 0])] = np.nan
+    flat = nearest.ravel()
+    return np.where(np.isinf(flat), _WINDOW_LIMITS_PX[0] / _WINDOW_SHARE, flat)
+
+
+def _right_handed(corners: Array, board: Board) -> Array:
+    """Return the corners ordered so that rows run clockwise from columns, as seen by a camera before the board."""
+    grid = corners.reshape(board.rows, board.columns, 2)
+    along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    clockwise = along[0] * down[1] - along[1] * down[0] > 0
+    return corners if clockwise else grid[::-1].reshape(-1, 2).copy()
+
+
+def _turns(corners: Array, board: Board) -> list[Array]:
+    grid = corners.reshape(board.rows, board.columns, 2)
+    quarters = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
+    return [np.rot90(grid, quarter, axes=(0, 1)).reshape(-1, 2).copy() for quarter in quarters]
+
+
+def _axis(corners: Array, board: Board) -> Array:
+    grid = corners.reshape(board.rows, board.columns, 2)
+    return np.asarray(np.mean(grid[:, -1] - grid[:, 0], axis=0))
+
+
+def require_size(image: Image, size: tuple[int, int], name: str) -> None:
+    """Raise InputError naming the image when it has another (width, height) than the rest."""
+    found = (image.shape[1], image.shape[0])
+    if found != size:
+        raise InputError(
+            f"{name}: is {found[0]}x{found[1]} px where the others are {size[0]}x{size[1]}; "
+            "take all pictures at one size, or move it away."
+        )
+
+
+Mask = NDArray[np.bool_]

@@ -1,0 +1,88 @@
+"""Views that do not fit the rest, named by file: a blurred board, a wrong picture, an eye that moved in between.
+
+A view of two pictures has one board pose, so a bad picture spoils its partner's residuals as well; which of the two
+is to blame is told by fitting the board to each alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morpheyes_daemon.calibration.bundle import Solution
+from morpheyes_daemon.calibration.projection import camera_from_vector
+from morpheyes_daemon.calibration.start import board_pose
+from morpheyes_daemon.calibration.views import Observations
+from morpheyes_daemon.transforms import Array
+
+_SUSPECT = 4.0
+"""A view is looked at when its rms is this many times the median of all views ..."""
+_LEAST_PX = 0.15
+"""... and at least this much above it: with near-perfect pictures nothing is an outlier."""
+_FEWEST_CORNERS = 8
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A picture taken out of the solve; `rms_px` is how badly it fitted."""
+
+    view: int
+    eye: int
+    name: str
+    rms_px: float
+
+
+def view_rms_px(residual_px: Array) -> Array:
+    """Return the rms per view and eye (V, 2) of the corner distance, NaN where that eye saw nothing.
+
+    As OpenCV counts it: the root of the mean squared length of the two-dimensional residuals.
+    """
+    squared = np.sum(residual_px**2, axis=-1)
+    seen = np.isfinite(squared)
+    count = seen.sum(axis=-1)
+    total = np.where(seen, squared, 0.0).sum(axis=-1)
+    return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+
+
+def find_outliers(observations: Observations, solution: Solution) -> list[Outlier]:
+    """Return the pictures that fit far worse than the rest, with the guilty eye named (both when neither fits)."""
+    rms = view_rms_px(solution.residual_px)
+    usual = float(np.nanmedian(rms))
+    limit = max(_SUSPECT * usual, usual + _LEAST_PX)
+    outliers = []
+    for view in np.flatnonzero(np.nanmax(rms, axis=1) > limit):
+        for eye in _guilty(observations, solution, int(view), rms[view], limit):
+            name = observations.names[view][eye]
+            outliers.append(Outlier(int(view), eye, name, float(rms[view, eye])))
+    return outliers
+
+
+def without(observations: Observations, outliers: list[Outlier]) -> tuple[Observations, NDArray[np.bool_]]:
+    """Return the observations with those pictures blanked, and which views (V,) still show a board to some eye."""
+    left, right = observations.left.copy(), observations.right.copy()
+    for outlier in outliers:
+        (left, right)[outlier.eye][outlier.view] = np.nan
+    seen = np.isfinite(left[..., 0]).sum(axis=1), np.isfinite(right[..., 0]).sum(axis=1)
+    kept = np.maximum(*seen) >= _FEWEST_CORNERS
+    return replace(observations, left=left, right=right).subset(kept), kept
+
+
+def _guilty(observations: Observations, solution: Solution, view: int, rms: Array, limit: float) -> list[int]:
+    """Return the eyes of a suspect view to take out."""
+    both = [eye for eye in (0, 1) if np.isfinite(rms[eye])]
+    alone = [_rms_alone(observations, solution, view, eye) for eye in both]
+    bad = [eye for eye, error in zip(both, alone, strict=True) if error > limit]
+    return bad or both
+
+
+def _rms_alone(observations: Observations, solution: Solution, view: int, eye: int) -> float:
+    """Return the rms of one picture with a board pose of its own."""
+    camera = camera_from_vector(solution.state.eyes[eye], observations.size)
+    T_cam_board = board_pose(observations, view, eye, camera)
+    if T_cam_board is None:
+        return np.inf
+    p_cam = observations.board.points_m @ T_cam_board[:3, :3].T + T_cam_board[:3, 3]
+    residual = (observations.left, observations.right)[eye][view] - camera.project(p_cam)
+    return float(np.sqrt(np.nanmean(np.sum(residual**2, axis=-1))))

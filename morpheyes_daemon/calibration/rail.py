@@ -1,0 +1,118 @@
+"""What a linear actuator can do: its eyes move along a line, and whatever else they do changes smoothly.
+
+Each of the six components of T_cam0_cam1 is a low-order polynomial of the nominal baseline plus a scatter of its own
+(play, the servo's repeatability). Order and scatter are chosen per component by how well the other baselines
+predict the one left out (leave-one-out predictive density of a Gaussian process with a flat prior on the
+polynomial; Rasmussen and Williams, 2006, sections 2.7 and 5.4.2), so a rail that wobbles is not straightened.
+What comes out is a quadratic on the unknowns of the joint solve; the pictures have the last word.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from morpheyes_daemon.calibration.bundle import EYES, POSE, Prior
+from morpheyes_daemon.transforms import Array
+
+COMPONENTS = ("rotation_x", "rotation_y", "rotation_z", "x", "y", "z")
+FEWEST_BASELINES = 4
+"""Below this a line through the baselines could not be told from chance."""
+_HIGHEST_ORDER = 4
+_SCATTER_RAD = np.geomspace(1e-6, 1e-2, 25)
+_SCATTER_M = np.geomspace(1e-6, 1e-2, 25)
+
+
+@dataclass(frozen=True)
+class RailComponent:
+    """How one component moves along the rail: polynomial order and scatter about it (rad or m, one sigma)."""
+
+    name: str
+    order: int
+    scatter: float
+
+
+@dataclass(frozen=True, eq=False)
+class Rail:
+    """The motion model of all six components for the nominal baselines (M,) it was fitted at."""
+
+    nominal_m: Array
+    components: tuple[RailComponent, ...]
+
+    def information(self) -> Array:
+        """Return the quadratic (6 M, 6 M) on the stacked poses: deviation from the best polynomial over scatter."""
+        count = len(self.nominal_m)
+        information = np.zeros((count, POSE, count, POSE))
+        for index, component in enumerate(self.components):
+            basis = polynomial(self.nominal_m, self.nominal_m, component.order)
+            orthonormal, _ = np.linalg.qr(basis)
+            away = np.eye(count) - orthonormal @ orthonormal.T
+            information[:, index, :, index] = away / component.scatter**2
+        return information.reshape(count * POSE, count * POSE)
+
+    def predict(self, poses: Array, covariance: Array, nominal_m: float) -> Array:
+        """Return the pose vector (6,) expected at another nominal baseline from solved poses (M, 6).
+
+        `covariance` (6 M, 6 M) is that of the poses. This is the polynomial's mean, without any baseline's scatter.
+        """
+        count = len(self.nominal_m)
+        blocks = covariance.reshape(count, POSE, count, POSE)
+        at = np.array([nominal_m])
+        predicted = np.empty(POSE)
+        for index, component in enumerate(self.components):
+            basis = polynomial(self.nominal_m, self.nominal_m, component.order)
+            spread = blocks[:, index, :, index] + np.eye(count) * component.scatter**2
+            weighted = np.linalg.solve(spread, basis)
+            coefficients = np.linalg.solve(basis.T @ weighted, weighted.T @ poses[:, index])
+            predicted[index] = (polynomial(at, self.nominal_m, component.order) @ coefficients)[0]
+        return predicted
+
+
+def fit_rail(nominal_m: Array, poses: Array, covariance: Array) -> Rail | None:
+    """Return the rail that predicts left-out baselines best, None for fewer than four baselines.
+
+    `poses` (M, 6) are solved freely, `covariance` (6 M, 6 M) is theirs, shared errors included.
+    """
+    count = len(nominal_m)
+    if count < FEWEST_BASELINES:
+        return None
+    blocks = covariance.reshape(count, POSE, count, POSE)
+    components = tuple(
+        _fit(name, nominal_m, poses[:, index], blocks[:, index, :, index], _SCATTER_RAD if index < 3 else _SCATTER_M)
+        for index, name in enumerate(COMPONENTS)
+    )
+    return Rail(nominal_m, components)
+
+
+def with_rail(prior: Prior, rail: Rail) -> Prior:
+    """Return the prior of the cameras with the rail's quadratic on the poses added."""
+    information = prior.information.copy()
+    information[EYES:, EYES:] += rail.information()
+    return Prior(prior.mean, information)
+
+
+def polynomial(nominal_m: Array, fitted_m: Array, order: int) -> Array:
+    """Return Chebyshev polynomials 0..order (n, order + 1) of baselines scaled to the fitted range."""
+    low, high = float(fitted_m.min()), float(fitted_m.max())
+    scaled = (2.0 * nominal_m - low - high) / (high - low)
+    return np.asarray(np.polynomial.chebyshev.chebvander(scaled, order))
+
+
+def _fit(name: str, nominal_m: Array, values: Array, covariance: Array, scatters: Array) -> RailComponent:
+    orders = range(0 if name != "x" else 1, min(_HIGHEST_ORDER, len(nominal_m) - 3) + 1)
+    choices = [(order, float(scatter)) for order in orders for scatter in scatters]
+    scores = [_left_out_density(nominal_m, values, covariance, *choice) for choice in choices]
+    order, scatter = choices[int(np.argmax(scores))]
+    return RailComponent(name, order, scatter)
+
+
+def _left_out_density(nominal_m: Array, values: Array, covariance: Array, order: int, scatter: float) -> float:
+    """Return the summed log density of each value given all the others, in closed form."""
+    basis = polynomial(nominal_m, nominal_m, order)
+    inverse = np.linalg.inv(covariance + scatter**2 * np.eye(len(values)))
+    weighted = inverse @ basis
+    projected = inverse - weighted @ np.linalg.solve(basis.T @ weighted, weighted.T)
+    precision = np.diag(projected)
+    error = projected @ values / precision
+    return float(0.5 * np.sum(np.log(precision) - precision * error**2))

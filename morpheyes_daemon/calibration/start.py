@@ -1,0 +1,115 @@
+"""A first guess for the joint solve: cameras one by one, a pose per view, the rig as the median over its views.
+
+OpenCV does this part; its lens without skew is near enough to start from.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morpheyes_daemon.calibration.bundle import RigState
+from morpheyes_daemon.calibration.projection import camera_from_vector
+from morpheyes_daemon.calibration.views import Observations
+from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
+from morpheyes_daemon.transforms import Array, R_from_rotvec, inverse, pose, q_from_R
+
+_VIEWS_PER_CAMERA = 30
+_FEWEST_CORNERS = 8
+_SUSPECT = 3.0
+"""Views this many times worse than the median do not count for the first guess."""
+
+
+def first_guess(observations: Observations) -> tuple[RigState, NDArray[np.bool_]]:
+    """Return a starting state for `bundle.solve` and which views (V,) have a usable pose.
+
+    The state covers the usable views only. Raises InputError when a camera cannot be guessed.
+    """
+    cameras = [_camera(observations, eye) for eye in (0, 1)]
+    T_left = [board_pose(observations, view, 0, cameras[0]) for view in range(observations.view_count)]
+    T_right = [board_pose(observations, view, 1, cameras[1]) for view in range(observations.view_count)]
+    between = np.array([_between(observations, i, T_left, T_right) for i in range(len(observations.nominal_m))])
+    poses: list[Array | None] = []
+    for view, (left, right) in enumerate(zip(T_left, T_right, strict=True)):
+        T_cam0_cam1 = _pose_of(between[observations.baseline[view]])
+        poses.append(left if left is not None else None if right is None else T_cam0_cam1 @ right)
+    usable = np.array([T is not None for T in poses])
+    boards = np.array([T for T in poses if T is not None])
+    eyes = np.array([[c.fx, c.fy, c.cx, c.cy, c.alpha, *c.k] for c in cameras])
+    return RigState(eyes, between, boards[:, :3, :3], boards[:, :3, 3]), usable
+
+
+def board_pose(observations: Observations, view: int, eye: int, camera: CameraIntrinsics) -> Array | None:
+    """Return T_cam_board (4, 4) of one eye's view by itself, None when too few corners are seen."""
+    pixels = (observations.left, observations.right)[eye][view]
+    seen = np.isfinite(pixels[:, 0])
+    if np.count_nonzero(seen) < _FEWEST_CORNERS:
+        return None
+    rays = camera.normalised_from_pixels(pixels[seen])
+    points = observations.board.points_m[seen]
+    straight = np.isfinite(rays[:, 0])
+    if np.count_nonzero(straight) < _FEWEST_CORNERS:
+        return None
+    flags = cv2.SOLVEPNP_ITERATIVE
+    found, turn, shift = cv2.solvePnP(points[straight], rays[straight], np.eye(3), None, flags=flags)
+    if not found or shift[2, 0] <= 0:
+        return None
+    return pose(R_from_rotvec(turn[:, 0]), shift[:, 0])
+
+
+def _camera(observations: Observations, eye: int) -> CameraIntrinsics:
+    pixels = (observations.left, observations.right)[eye]
+    counts = np.isfinite(pixels[..., 0]).sum(axis=1)
+    good = np.flatnonzero(counts >= min(observations.board.corner_count, 2 * _FEWEST_CORNERS))
+    if len(good) < 3:
+        name = "left" if eye == 0 else "right"
+        raise InputError(f"The {name} eye sees the board in only {len(good)} pictures; take at least ten per baseline.")
+    chosen = good[np.unique(np.linspace(0, len(good) - 1, _VIEWS_PER_CAMERA).round().astype(int))]
+    camera, error = _opencv(observations, pixels, chosen)
+    sound = error <= _SUSPECT * np.median(error)
+    if not sound.all() and np.count_nonzero(sound) >= 3:
+        camera, _ = _opencv(observations, pixels, chosen[sound])
+    return camera
+
+
+def _opencv(
+    observations: Observations, pixels: Array, views: NDArray[np.intp]
+) -> tuple[CameraIntrinsics, Array]:
+    seen = [np.isfinite(pixels[view, :, 0]) for view in views]
+    points = [observations.board.points_m[mask].astype(np.float32) for mask in seen]
+    corners = [pixels[view][mask].astype(np.float32) for view, mask in zip(views, seen, strict=True)]
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    _, K, d, _, _, _, _, error = cv2.calibrateCameraExtended(
+        points, corners, observations.size, None, None, flags=flags
+    )
+    d = d.ravel()
+    vector = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0.0, d[0], d[1], 0.0, 0.0, 0.0])
+    return camera_from_vector(vector, observations.size), error.ravel()
+
+
+def _between(
+    observations: Observations, baseline: int, T_left: list[Array | None], T_right: list[Array | None]
+) -> Array:
+    """Return T_cam0_cam1 of one baseline as (rotation vector, metres), the median over its views."""
+    views = np.flatnonzero(observations.baseline == baseline)
+    poses = [left @ inverse(right) for v in views if (left := T_left[v]) is not None and (right := T_right[v]) is not None]
+    if not poses:
+        raise InputError(
+            f"At {observations.nominal_m[baseline] * 1e3:g} mm no picture shows the board to both eyes; retake them."
+        )
+    vectors = np.array([[*_rotvec(T[:3, :3]), *T[:3, 3]] for T in poses])
+    return np.asarray(np.median(vectors, axis=0))
+
+
+def _rotvec(R: Array) -> Array:
+    q = q_from_R(R)
+    sine = float(np.linalg.norm(q[1:]))
+    return q[1:] * (2.0 if sine < 1e-12 else 2.0 * np.arctan2(sine, q[0]) / sine)
+
+
+def _pose_of(vector: Array) -> Array:
+    return pose(R_from_rotvec(vector[:3]), vector[3:])
+
+

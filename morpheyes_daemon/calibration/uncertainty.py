@@ -1,0 +1,77 @@
+"""How well the solve knows what it found: the covariance of the unknowns carried to what a person asks about.
+
+Length of the baseline, and the disparity bias at infinity given as an equivalent yaw (yaw and principal points can
+hardly be told apart, but only their joint effect reaches the depth). What the covariance cannot know, such as a
+board that is not flat, is not in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from morpheyes_daemon.calibration.bundle import EYES, POSE
+from morpheyes_daemon.calibration.projection import CAMERA_PARAMETERS, camera_from_vector
+from morpheyes_daemon.calibration.rectified import StereoGeometry, infinity_px
+from morpheyes_daemon.calibration.solver import Calibration
+from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
+
+_STEP = 1e-2
+"""Of a sigma: the numeric derivative's step; everything is linear over it."""
+
+
+@dataclass(frozen=True)
+class BaselineUncertainty:
+    """One standard deviation each of what one baseline's geometry is used for."""
+
+    length_m: float
+    disparity_px: float
+    yaw_rad: float
+
+
+def baseline_uncertainty(calibration: Calibration, index: int) -> BaselineUncertainty:
+    """Return the uncertainty of the baseline's length and of the disparity at infinity there."""
+    solution = calibration.solution
+    columns = np.concatenate([np.arange(EYES), EYES + POSE * index + np.arange(POSE)])
+    covariance = solution.covariance[np.ix_(columns, columns)]
+    values = solution.state.shared[columns]
+    true = _geometry(values, calibration.observations.size)
+    bias = _derivative(values, covariance, lambda v: _bias_px(v, true, calibration.observations.size))
+    direction = values[EYES + 3 :] / np.linalg.norm(values[EYES + 3 :])
+    length = float(np.sqrt(direction @ covariance[EYES + 3 :, EYES + 3 :] @ direction))
+    sigma_px = float(np.sqrt(bias @ covariance @ bias))
+    return BaselineUncertainty(length, sigma_px, sigma_px / true.f_px)
+
+
+def camera_uncertainty(calibration: Calibration) -> tuple[dict[str, float], dict[str, float]]:
+    """Return one standard deviation per camera parameter, left and right eye."""
+    sigma = np.sqrt(np.diag(calibration.solution.covariance)[:EYES]).reshape(2, -1)
+    left, right = (dict(zip(CAMERA_PARAMETERS, map(float, eye), strict=True)) for eye in sigma)
+    return left, right
+
+
+def pose_uncertainty(calibration: Calibration, index: int) -> Array:
+    """Return one standard deviation (6,) of the rotation vector (rad) and translation (m) at one baseline."""
+    start = EYES + POSE * index
+    return np.asarray(np.sqrt(np.diag(calibration.solution.covariance)[start : start + POSE]))
+
+
+def _geometry(values: Array, size: tuple[int, int]) -> StereoGeometry:
+    T_cam0_cam1 = pose(R_from_rotvec(values[EYES : EYES + 3]), values[EYES + 3 :])
+    return StereoGeometry(camera_from_vector(values[:10], size), camera_from_vector(values[10:20], size), T_cam0_cam1)
+
+
+def _bias_px(values: Array, true: StereoGeometry, size: tuple[int, int]) -> float:
+    return float(np.mean(infinity_px(_geometry(values, size), true)))
+
+
+def _derivative(values: Array, covariance: Array, function: Callable[[Array], float]) -> Array:
+    steps = _STEP * np.sqrt(np.diag(covariance))
+    slopes = np.zeros(len(values))
+    for i, step in enumerate(steps):
+        shift = np.zeros(len(values))
+        shift[i] = step
+        slopes[i] = (function(values + shift) - function(values - shift)) / (2 * step)
+    return slopes
