@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import Event, Perception
+from morpheyes_daemon.messages import Event, Intent, Perception
+from morpheyes_daemon.safety.states import State
 
 Column = NDArray[np.float64]
 
+ONE_BRAKING_S = 1.0
+"""Gate and mission often brake for the same thing; within this time it counts once."""
 KEPT = ("perception", "vehicle", "command", "governed", "gate", "baseline")
 
 
@@ -103,3 +106,19 @@ class FlightSeries:
         starts = [i for i in range(len(words)) if i == 0 or words[i] != words[i - 1]]
         ends = [*(float(times[i]) for i in starts[1:]), self.duration_s]
         return [(float(times[i]), end, words[i]) for i, end in zip(starts, ends, strict=True)]
+
+    def braking(self) -> list[tuple[float, str]]:
+        """Return (second, reason) of each time the vehicle was made to stop, by the gate or by the mission."""
+        by_gate = self._beginnings("gate", lambda output: output.state == State.BRAKING)
+        by_mission = self._beginnings("command", lambda command: command.intent == Intent.STOP)
+        merged: list[tuple[float, str]] = []
+        for t, reason in sorted(by_gate + by_mission):
+            if not merged or t - merged[-1][0] > ONE_BRAKING_S:
+                merged.append((t, reason))
+        return merged
+
+    def _beginnings(self, topic: str, holds: Callable[[Any], bool]) -> list[tuple[float, str]]:
+        rows = self._messages[topic]
+        now = [holds(m) for m in rows]
+        first = [m for m, is_so, was_so in zip(rows, now, [False, *now], strict=False) if is_so and not was_so]
+        return [(self.seconds(m.t_ns), str(m.reason or "")) for m in first]

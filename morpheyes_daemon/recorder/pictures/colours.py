@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import cv2
@@ -15,29 +16,29 @@ MAX_BASELINE_M = 0.3
 
 NEAR_M = 0.5
 FAR_M = 30.0
+FARTHEST = 18
+"""Where the turbo scale starts: below it lie colours as dark as unknown."""
 UNKNOWN_BGR = (38, 34, 32)
 
 
 @cache
-def _palette(colormap: int) -> Image:
+def _jet() -> list[tuple[int, int, int]]:
     ramp = np.arange(256, dtype=np.uint8).reshape(256, 1)
-    return np.asarray(cv2.applyColorMap(ramp, colormap), dtype=np.uint8).reshape(256, 3)
+    return [(int(b), int(g), int(r)) for b, g, r in cv2.applyColorMap(ramp, cv2.COLORMAP_JET).reshape(256, 3)]
 
 
 def baseline_bgr(baseline_m: float) -> tuple[int, int, int]:
     """Return the jet colour of a baseline."""
     share = (baseline_m - MIN_BASELINE_M) / (MAX_BASELINE_M - MIN_BASELINE_M)
-    index = int(np.clip(np.nan_to_num(share) * 255.0, 0, 255))
-    b, g, r = _palette(cv2.COLORMAP_JET)[index]
-    return int(b), int(g), int(r)
+    return _jet()[0 if math.isnan(share) else round(255 * min(1.0, max(0.0, share)))]
 
 
 def colour_depth(depth_m: FloatMap, near_m: float = NEAR_M, far_m: float = FAR_M) -> Image:
     """Return (H, W, 3) BGR of a depth map in metres, NaN unknown; equal ratios of depth are equal steps of colour."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.log(far_m / depth_m) / np.log(far_m / near_m)
-    known = np.isfinite(share)
-    index = np.where(known, np.clip(share, 0.0, 1.0) * 255.0, 0.0).astype(np.uint8)
-    picture = _palette(cv2.COLORMAP_TURBO)[index]
+    known = depth_m > 0.0
+    scale = (255 - FARTHEST) / math.log(far_m / near_m)
+    index = np.log(np.where(known, depth_m, far_m), dtype=np.float32)
+    index = np.clip(255.0 - scale * (index - math.log(near_m)), FARTHEST, 255.0)
+    picture = np.asarray(cv2.applyColorMap(index.astype(np.uint8), cv2.COLORMAP_TURBO), dtype=np.uint8)
     picture[~known] = UNKNOWN_BGR
     return picture

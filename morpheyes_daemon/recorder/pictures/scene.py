@@ -1,0 +1,38 @@
+"""What stood around the flight, seen from above: only known in the simulator, or when somebody measured it.
+
+Plain shapes in ned metres, so that the recorder needs no world model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Disc:
+    """A trunk or post: centre north and east, radius."""
+
+    x_m: float
+    y_m: float
+    radius_m: float
+
+
+Polygon = tuple[tuple[float, float], ...]
+"""Corners (north, east) in metres of a wall or house."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Obstacles, start and goal (north, east) in metres; each of them may be unknown."""
+
+    discs: tuple[Disc, ...] = ()
+    polygons: tuple[Polygon, ...] = ()
+    start_m: tuple[float, float] | None = None
+    goal_m: tuple[float, float] | None = None
+
+    def disc_array(self) -> NDArray[np.float64]:
+        """Return the discs as (N, 3): north, east, radius."""
+        return np.array([(d.x_m, d.y_m, d.radius_m) for d in self.discs], dtype=np.float64).reshape(-1, 3)
