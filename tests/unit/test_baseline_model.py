@@ -11,22 +11,10 @@ from morpheyes_daemon.config import NoServoConfig, SerialServoConfig, ServoMotio
 from morpheyes_daemon.control.baseline import HISTORY_NS, BaselineModel, FixedBaseline, baseline_for, baseline_model
 from morpheyes_daemon.simulation.teensy_twin import ServoFault, ServoTruth, TeensyTwin
 from morpheyes_daemon.wire.servo import SetTarget, encode
+from tests.hand_clock import HandClock
 
 MOTION = ServoMotion()
 REPEATABILITY_M = MOTION.repeatability_sigma_mm / 1e3
-
-
-class HandClock:
-    """A clock that a test sets."""
-
-    def __init__(self) -> None:
-        self.t_ns = 1000 * S
-
-    def now_ns(self) -> int:
-        return self.t_ns
-
-    async def sleep_until_ns(self, t_ns: int) -> None:
-        raise AssertionError("nothing sleeps here")
 
 
 def twin_on(clock: HandClock, seed: int = 0, truth: ServoTruth | None = None) -> TeensyTwin:
