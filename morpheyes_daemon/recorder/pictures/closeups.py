@@ -15,6 +15,8 @@ LEFT_IN, BOTTOM_IN, WIDTH_IN, HEIGHT_IN, APART_IN = 4.9, 0.14, 2.2, 1.66, 0.15
 NORTH_M = 3.2
 EVERY_M = 0.45
 INK = "#30343a"
+NEAREST = {"lw": 1.2, "alpha": 1.0, "zorder": 6}
+AROUND = {"lw": 0.6, "alpha": 0.6, "zorder": 4}
 PLATE = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
 CIRCLE = {"boxstyle": "circle,pad=0.18", "facecolor": "white", "edgecolor": INK, "linewidth": 0.7}
 
@@ -65,7 +67,7 @@ def _draw(panel: Any, track: Track, scene: Scene, footprint: Footprint, i: int) 
         hull, bar = boxes(footprint, float(track.baseline_m[j]))
         b, g, r = (c / 255 for c in baseline_bgr(float(track.baseline_m[j])))
         at, yaw = track.xy_m[j], float(track.yaw_rad[j])
-        strength = {"lw": 1.2, "alpha": 1.0, "zorder": 6} if j == i else {"lw": 0.6, "alpha": 0.6, "zorder": 4}
+        strength: dict[str, Any] = NEAREST if j == i else AROUND
         panel.add_patch(Polygon(placed(hull, at, yaw), facecolor="white", edgecolor=INK, **strength))
         panel.add_patch(Polygon(placed(bar, at, yaw), facecolor=(r, g, b), edgecolor=INK, **strength))
 

@@ -126,12 +126,12 @@ def _figures(canvas: Image, seconds: float, newest: Newest) -> None:
     if newest.baseline is not None:
         _slider(canvas, 500, newest.baseline.baseline_m)
         _write(canvas, 742, f"baseline {1e3 * newest.baseline.baseline_m:3.0f} mm")
-    _write(canvas, 974, state)
-    _write(canvas, 1100, reason.text if reason is not None and state != "ENGAGED" else "", DIM)
+    _write(canvas, 910, state)
+    _write(canvas, 1010, reason.text if reason is not None and state != "ENGAGED" else "", DIM, 0.48)
 
 
-def _write(canvas: Image, u: int, text: str, colour: tuple[int, int, int] = WHITE) -> None:
-    cv2.putText(canvas, text, (u, PANEL_H + 26), FONT, 0.56, colour, 1, cv2.LINE_AA)
+def _write(canvas: Image, u: int, text: str, colour: tuple[int, int, int] = WHITE, size: float = 0.56) -> None:
+    cv2.putText(canvas, text, (u, PANEL_H + 26), FONT, size, colour, 1, cv2.LINE_AA)
 
 
 def _slider(canvas: Image, u: int, baseline_m: float) -> None:

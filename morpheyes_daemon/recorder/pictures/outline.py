@@ -53,7 +53,7 @@ def boxes(footprint: Footprint, baseline_m: float) -> tuple[Array, Array]:
 def _box(forward_m: float, length_m: float, width_m: float) -> Array:
     half_l, half_w = length_m / 2, width_m / 2
     corners = [(half_l, -half_w), (half_l, half_w), (-half_l, half_w), (-half_l, -half_w)]
-    return np.array(corners) + np.array([forward_m, 0.0])
+    return np.asarray(np.array(corners) + np.array([forward_m, 0.0]))
 
 
 def placed(box: Array, xy_m: Array, yaw_rad: float) -> Array:
