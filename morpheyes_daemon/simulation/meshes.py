@@ -1,0 +1,151 @@
+"""Shapes as triangles: trunks, crowns, ground, boxes. Pure geometry in ned axes; colours come with the material."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Triangles = NDArray[np.int32]
+Surface = tuple[Array, Array, Array, Triangles]
+"""vertices_m (V, 3), uv_m (V, 2), outward unit normals (V, 3), triangles (T, 3)."""
+
+
+def frustum(base: Array, top: Array, radius_base_m: float, radius_top_m: float, sides: int) -> Surface:
+    """Return the side of a tapered cylinder from `base` to `top` (3,).
+
+    The polygon's radius is enlarged so that it errs from the circle by as much inwards as outwards.
+    """
+    axis = top - base
+    height = float(np.linalg.norm(axis))
+    axis = axis / height
+    across = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    angle = np.arange(sides + 1) * (2.0 * math.pi / sides)
+    ring = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
+    ring[-1] = ring[0]
+    grown = 2.0 / (1.0 + math.cos(math.pi / sides))
+    vertices = np.concatenate([base + grown * radius_base_m * ring, top + grown * radius_top_m * ring])
+    around = max(1.0, round(2.0 * math.pi * max(radius_base_m, radius_top_m))) * np.arange(sides + 1) / sides
+    uv = np.concatenate([np.column_stack([around, np.full(sides + 1, v)]) for v in (0.0, height)])
+    i = np.arange(sides, dtype=np.int32)
+    low, high = i, i + sides + 1
+    quads = np.concatenate([np.column_stack([low, low + 1, high]), np.column_stack([low + 1, high + 1, high])])
+    return vertices, uv, np.concatenate([ring, ring]), quads.astype(np.int32)
+
+
+def icosphere(subdivisions: int) -> tuple[Array, Triangles]:
+    """Return unit vertices (V, 3) and triangles of a subdivided icosahedron."""
+    phi = (1.0 + math.sqrt(5.0)) / 2.0
+    corners = [(s * 1.0, t * phi, 0.0) for s in (-1, 1) for t in (-1, 1)]
+    points = [np.roll(c, k) for k in range(3) for c in corners]
+    vertices = np.array(points) / math.hypot(1.0, phi)
+    triangles = _hull_of_icosahedron(vertices)
+    for _ in range(subdivisions):
+        vertices, triangles = _subdivide(vertices, triangles)
+    return vertices, triangles
+
+
+def _hull_of_icosahedron(v: Array) -> Triangles:
+    """Neighbours of an icosahedron are its closest pairs; faces are triples of neighbours, turned outwards."""
+    near = np.linalg.norm(v[:, None] - v[None], axis=2) < 1.2
+    faces = []
+    for a in range(12):
+        for b in range(a + 1, 12):
+            for c in range(b + 1, 12):
+                if near[a, b] and near[b, c] and near[a, c]:
+                    outwards = np.dot(np.cross(v[b] - v[a], v[c] - v[a]), v[a]) > 0
+                    faces.append((a, b, c) if outwards else (a, c, b))
+    return np.array(faces, np.int32)
+
+
+def _subdivide(vertices: Array, triangles: Triangles) -> tuple[Array, Triangles]:
+    points = list(vertices)
+    middle: dict[tuple[int, int], int] = {}
+
+    def between(a: int, b: int) -> int:
+        key = (min(a, b), max(a, b))
+        if key not in middle:
+            m = points[a] + points[b]
+            middle[key] = len(points)
+            points.append(m / np.linalg.norm(m))
+        return middle[key]
+
+    faces = []
+    for a, b, c in triangles.tolist():
+        ab, bc, ca = between(a, b), between(b, c), between(c, a)
+        faces += [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return np.array(points), np.array(faces, np.int32)
+
+
+def blob(rng: np.random.Generator, centre: Array, radii: Array, subdivisions: int, roughness: float) -> Surface:
+    """Return an ellipsoid whose surface is pushed inwards at random by up to `roughness` of its radius."""
+    unit, triangles = icosphere(subdivisions)
+    pushed = unit * (1.0 - roughness * rng.random((len(unit), 1)))
+    normals = unit / radii
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    uv = np.column_stack([unit[:, 0] * 0.8 + unit[:, 2], unit[:, 1] * 0.8 - 0.6 * unit[:, 2]]) * float(np.mean(radii))
+    return centre + pushed * radii, uv + rng.random(2), normals, triangles
+
+
+def leaf_cards(rng: np.random.Generator, centre: Array, radii: Array, count: int, size_m: float) -> Surface:
+    """Return `count` loose two-sided triangles in the outer half of an ellipsoid, as tufts of leaves."""
+    direction = rng.standard_normal((count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    middle = centre + direction * radii * rng.uniform(0.72, 1.0, (count, 1)) * 0.93
+    spread = rng.standard_normal((count, 3, 3))
+    spread /= np.linalg.norm(spread, axis=2, keepdims=True)
+    corners = middle[:, None] + size_m * rng.uniform(0.5, 1.0, (count, 1, 1)) * spread
+    # stay inside the ellipsoid that stands for the crown in collisions
+    offset = (corners - centre) / radii
+    length = np.linalg.norm(offset, axis=2, keepdims=True)
+    corners = centre + offset / np.maximum(length, 1.0) * radii
+    uv = (rng.random((count, 1, 2)) + size_m * rng.uniform(-0.8, 0.8, (count, 3, 2))).reshape(-1, 2)
+    normals = np.repeat(direction, 3, axis=0)
+    return corners.reshape(-1, 3), uv, normals, np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+
+
+def cone_tier(rng: np.random.Generator, base: Array, height_m: float, radius_m: float, points: int) -> Surface:
+    """Return a drooping, ragged cone of needles with its tip `height_m` above `base`."""
+    angle = (np.arange(2 * points) + 0.25 * rng.random(2 * points)) * (math.pi / points) + rng.random()
+    reach = radius_m * np.where(np.arange(2 * points) % 2 == 0, rng.uniform(0.86, 1.0, 2 * points), 0.58)
+    droop = height_m * np.where(np.arange(2 * points) % 2 == 0, 0.0, 0.22)
+    rim = base + np.column_stack([reach * np.cos(angle), reach * np.sin(angle), -droop])
+    tip = base + np.array([0.0, 0.0, -height_m])
+    vertices = np.concatenate([rim, np.repeat(tip[None], 2 * points, axis=0)])
+    along = np.arange(2 * points) * (2.0 * radius_m * math.pi / (2 * points))
+    uv = np.concatenate([np.column_stack([along, np.zeros(2 * points)]),
+                         np.column_stack([along, np.full(2 * points, math.hypot(height_m, radius_m))])])
+    outwards = np.column_stack([np.cos(angle), np.sin(angle), np.full(2 * points, -0.6)])
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    i = np.arange(2 * points, dtype=np.int32)
+    triangles = np.column_stack([(i + 1) % (2 * points), i, i + 2 * points]).astype(np.int32)
+    return vertices, uv, np.concatenate([outwards, outwards]), triangles
+
+
+def sky_dome(rings: int = 12, segments: int = 24, radius_m: float = 1e5) -> Surface:
+    """Return a sphere seen from inside; u is azimuth / 2 pi, v is (90 deg - elevation) / 180 deg."""
+    v, u = np.meshgrid(np.linspace(0, 1, rings + 1), np.linspace(0, 1, segments + 1), indexing="ij")
+    elevation, azimuth = (0.5 - v) * math.pi, u * 2 * math.pi
+    unit = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), -np.sin(elevation)], -1)
+    unit[:, -1] = unit[:, 0]
+    i = np.arange(rings * (segments + 1)).reshape(rings, segments + 1)[:, :-1].ravel()
+    right, down = i + 1, i + segments + 1
+    triangles = np.concatenate([np.column_stack([i, right, down]), np.column_stack([right, right + segments + 1, down])])
+    unit = unit.reshape(-1, 3)
+    return radius_m * unit, np.column_stack([u.ravel(), v.ravel()]), -unit, triangles.astype(np.int32)
+
+
+def terrain(x_m: Array, y_m: Array, height_m: Array) -> Surface:
+    """Return a height field over a grid; height_m (len(x), len(y)) is upwards. uv are x and y."""
+    x, y = np.meshgrid(x_m, y_m, indexing="ij")
+    vertices = np.column_stack([x.ravel(), y.ravel(), -height_m.ravel()])
+    dx, dy = np.gradient(height_m, x_m, y_m)
+    normals = np.column_stack([-dx.ravel(), -dy.ravel(), -np.ones(x.size)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    i = np.arange(x.size).reshape(x.shape)[:-1, :-1].ravel()
+    north, east = i + len(y_m), i + 1
+    triangles = np.concatenate([np.column_stack([i, east, north]), np.column_stack([east, north + 1, north])])
+    return vertices, vertices[:, :2].copy(), normals, triangles.astype(np.int32)

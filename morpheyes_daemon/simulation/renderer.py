@@ -1,0 +1,156 @@
+"""The software renderer: a `Scene` seen by an ideal pinhole, as linear radiance, exact depth and object ids.
+
+Needs numba only, runs on any CPU, gives the same bits on every run and in every thread, and releases the
+interpreter lock. A `Renderer` owns its buffers, so each thread has its own. Lens, noise and exposure are the camera
+twin's business.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morpheyes_daemon.messages import FloatMap, Image, Pinhole
+from morpheyes_daemon.simulation.raster import PLANES, SAMPLES, rasterise
+from morpheyes_daemon.simulation.scene import SKY_OBJECT, Material, Mesh, Scene
+from morpheyes_daemon.simulation.shading import shade_image
+from morpheyes_daemon.simulation.textures import Atlas, pack
+from morpheyes_daemon.transforms import Array, inverse, pose
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """radiance (H, W, 3) float32 linear BGR, depth_m (H, W) float32 along z (inf: sky), objects (H, W) int32."""
+
+    radiance: FloatMap
+    depth_m: FloatMap
+    objects: NDArray[np.int32]
+
+    @cached_property
+    def image(self) -> Image:
+        """BGR uint8 (H, W, 3) at unit exposure, encoded by the square root."""
+        return encode(self.radiance)
+
+
+def encode(radiance: FloatMap) -> Image:
+    """Return 255 times the square root of radiance, clipped, as uint8."""
+    value = np.sqrt(np.clip(radiance, 0.0, 1.0), dtype=np.float32) * np.float32(255.0) + np.float32(0.5)
+    return np.asarray(value, dtype=np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Batch:
+    """Meshes of one frame laid out for `rasterise`."""
+
+    vertices: Array
+    attributes: Array
+    triangles: NDArray[np.int32]
+    bounds: Array
+    ranges: NDArray[np.int64]
+    flags: NDArray[np.bool_]
+    first_part: int
+
+
+def _batch(meshes: Sequence[Mesh], first_part: int) -> _Batch:
+    sizes = np.array([[len(m.vertices_m), len(m.triangles)] for m in meshes], np.int64).reshape(-1, 2)
+    ends = np.cumsum(sizes, axis=0)
+    starts = ends - sizes
+    vertices = np.concatenate([m.vertices_m for m in meshes]).astype(np.float64)
+    attributes = np.concatenate([np.column_stack([m.uv_m, m.sun]) for m in meshes]).astype(np.float64)
+    triangles = np.concatenate([m.triangles + s for m, s in zip(meshes, starts[:, 0], strict=True)])
+    bounds = np.array([(*_sphere(m.vertices_m), *m.draw_range_m) for m in meshes], np.float64)
+    ranges = np.column_stack([starts[:, 0], ends[:, 0], starts[:, 1], ends[:, 1]])
+    flags = np.array([(m.two_sided, m.loose) for m in meshes])
+    return _Batch(vertices, attributes, triangles.astype(np.int32), bounds, ranges, flags, first_part)
+
+
+def _sphere(vertices: Array) -> tuple[float, float, float, float]:
+    centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    radius = float(np.linalg.norm(vertices - centre, axis=1).max())
+    return float(centre[0]), float(centre[1]), float(centre[2]), radius
+
+
+class Renderer:
+    """Draws one scene; not to be shared between threads."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._atlas: Atlas = pack(scene.textures)
+        names = {name: i for i, name in enumerate(scene.materials)}
+        self._materials = np.array([self._material_row(m) for m in scene.materials.values()])
+        sky = (scene.sky,) if scene.sky is not None else ()
+        groups = [tuple(scene.meshes), sky, *(body.meshes for body in scene.moving)]
+        meshes = [mesh for group in groups for mesh in group]
+        starts = np.cumsum([0, *(len(group) for group in groups)])
+        self._batches = [_batch(g, int(s)) if g else None for g, s in zip(groups, starts, strict=False)]
+        self._looks = np.array([(*m.tint, m.ambient) for m in meshes])
+        self._part_materials = np.array([names[m.material] for m in meshes], np.int64)
+        self._part_objects = np.array([m.object_id for m in meshes], np.int32)
+        light = scene.light
+        self._light = np.array([light.sun, light.sky, light.haze, (1.0 / light.haze_range_m, 0.0, 0.0)])
+        triangles = sum(len(mesh.triangles) for mesh in meshes)
+        self._records = np.empty((triangles, PLANES))
+        self._record_parts = np.empty(triangles, np.int32)
+        self._record_groups = np.empty(triangles, np.int32)
+        self._buffers: dict[tuple[int, int], tuple[FloatMap, NDArray[np.int32]]] = {}
+
+    def sibling(self) -> Renderer:
+        """Return a renderer of the same scene with buffers of its own, for another thread."""
+        other = copy.copy(self)
+        other._records = np.empty_like(self._records)
+        other._record_parts = np.empty_like(self._record_parts)
+        other._record_groups = np.empty_like(self._record_groups)
+        other._buffers = {}
+        return other
+
+    def _material_row(self, m: Material) -> tuple[float, ...]:
+        index = self._atlas.names.index
+        modulation = -1 if m.modulation is None else index(m.modulation)
+        kind = 2.0 if m.sky else 1.0 if m.emissive else 0.0
+        return (index(m.texture), *m.tiles_per_m, modulation, *m.modulation_tiles_per_m, kind)
+
+    def render(self, T_ned_cam: Array, pinhole: Pinhole, t_s: float = 0.0, eye_ned: Array | None = None) -> Rendered:
+        """Render what a camera at `T_ned_cam` (4, 4; x right, y down, z forward) sees at world time `t_s`.
+
+        `eye_ned` (3,) is what drawing ranges are measured from; pass the same for both eyes of a pair.
+        """
+        shape = (pinhole.height, pinhole.width)
+        inverse_z, indices = self._cleared(shape)
+        intrinsics = (pinhole.f_px, pinhole.cx_px, pinhole.cy_px)
+        eye = T_ned_cam[:3, 3] if eye_ned is None else eye_ned
+        frames = [np.eye(4), pose(np.eye(3), T_ned_cam[:3, 3])]
+        frames += [body.T_ned_object(t_s) for body in self.scene.moving]
+        count = 0
+        for batch, T_ned_batch in zip(self._batches, frames, strict=True):
+            if batch is not None:
+                T_cam_batch = inverse(T_ned_cam) @ T_ned_batch
+                eye_batch = inverse(T_ned_batch)[:3, :3] @ (eye - T_ned_batch[:3, 3])
+                count = rasterise(
+                    batch.vertices, batch.attributes, batch.triangles, batch.bounds, batch.ranges, batch.flags,
+                    batch.first_part, T_cam_batch[:3, :3].copy(), T_cam_batch[:3, 3].copy(), eye_batch, intrinsics,
+                    SAMPLES, inverse_z, indices, self._records, self._record_parts,
+                    self._record_groups, count,
+                )  # fmt: skip
+        rendered = Rendered(
+            np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.full(shape, SKY_OBJECT, np.int32)
+        )
+        shade_image(
+            indices, SAMPLES, self._records, self._record_parts, self._record_groups, self._looks, self._part_materials,
+            self._part_objects, self._materials, (self._atlas.texels, self._atlas.levels, self._atlas.log_sizes),
+            self._light, rendered.radiance, rendered.depth_m, rendered.objects,
+        )  # fmt: skip
+        return rendered
+
+    def _cleared(self, shape: tuple[int, int]) -> tuple[FloatMap, NDArray[np.int32]]:
+        if shape not in self._buffers:
+            planes = (len(SAMPLES), *shape)
+            self._buffers[shape] = np.empty(planes, np.float32), np.empty(planes, np.int32)
+        inverse_z, indices = self._buffers[shape]
+        inverse_z.fill(0.0)
+        indices.fill(-1)
+        return inverse_z, indices

@@ -1,0 +1,197 @@
+"""Seeded textures made on the spot, rich in detail at every scale, and their mip levels.
+
+Stereo matching lives on texture: the spectra fall as 1/f, so contrast stays the same at every distance. Values are
+the square root of linear reflectance times 255, which spends the 8 bits where they are seen. All textures are
+square, a power of two wide, and repeat without a seam. Made with OpenCV's drawing and numpy's FFT.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Texels = NDArray[np.uint8]
+Field = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Texture:
+    """texels (N, N, 4) uint8: square root of linear blue, green, red, and a fourth channel (share of sunlight)."""
+
+    texels: Texels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Atlas:
+    """All textures with their mip levels in one array, texels (n, 4), as the kernels want them."""
+
+    names: tuple[str, ...]
+    texels: Texels
+    levels: NDArray[np.int64]
+    log_sizes: NDArray[np.int64]
+
+
+def pack(textures: Mapping[str, Texture]) -> Atlas:
+    """Lay out the mip levels of all textures."""
+    chains = [_mip_chain(texture) for texture in textures.values()]
+    levels = np.zeros((len(chains), max((len(chain) for chain in chains), default=1)), np.int64)
+    start = 0
+    for i, chain in enumerate(chains):
+        for k, level in enumerate(chain):
+            levels[i, k] = start
+            start += level.shape[0] * level.shape[1]
+    flat = np.concatenate([level.reshape(-1, 4) for chain in chains for level in chain])
+    return Atlas(tuple(textures), flat, levels, np.array([len(chain) - 1 for chain in chains], np.int64))
+
+
+def _mip_chain(texture: Texture) -> list[Texels]:
+    """Halve down to one texel; colours are averaged linearly."""
+    value = texture.texels.astype(np.float32)
+    value[..., :3] **= 2
+    chain = [texture.texels]
+    while value.shape[0] > 1:
+        value = 0.25 * (value[::2, ::2] + value[1::2, ::2] + value[::2, 1::2] + value[1::2, 1::2])
+        encoded = value.copy()
+        encoded[..., :3] **= 0.5
+        chain.append(np.rint(encoded).astype(np.uint8))
+    return chain
+
+
+def noise(rng: np.random.Generator, size: int, stretch: tuple[float, float] = (1.0, 1.0), slope: float = 1.0) -> Field:
+    """Return a periodic (size, size) field with mean 0, sigma 1 and amplitude 1/f**slope.
+
+    `stretch` (u, v) lengthens its features along an axis, as bark does.
+    """
+    fu = np.fft.rfftfreq(size)[None, :] * stretch[0] * size
+    fv = np.fft.fftfreq(size)[:, None] * stretch[1] * size
+    f = np.hypot(fu, fv)
+    f[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.standard_normal((size, size))) / f**slope
+    field = np.fft.irfft2(spectrum, s=(size, size))
+    return np.asarray((field - field.mean()) / field.std())
+
+
+def coloured(value: Field, stops: list[tuple[float, tuple[int, int, int]]]) -> Field:
+    """Map a field to BGR 0..255 through colour stops (value, (r, g, b))."""
+    at = [stop for stop, _ in stops]
+    return np.stack([np.interp(value, at, [rgb[k] for _, rgb in stops]) for k in (2, 1, 0)], axis=-1)
+
+
+def finished(bgr: Field, alpha: Field | float = 255.0) -> Texture:
+    """Round to a texture."""
+    size = bgr.shape[0]
+    texels = np.empty((size, size, 4), np.uint8)
+    texels[..., :3] = np.clip(np.rint(bgr), 0, 255)
+    texels[..., 3] = np.clip(np.rint(alpha), 0, 255)
+    return Texture(texels)
+
+
+@cache
+def bark(seed: int, size: int = 1024) -> Texture:
+    """Furrowed bark, one metre square, v along the trunk."""
+    rng = np.random.default_rng([seed, 1])
+    warp = noise(rng, size, slope=1.6)
+    ridges = 1.0 - np.abs(noise(rng, size, (1.0, 5.0), 1.1) + 0.25 * warp)
+    fine = noise(rng, size, (1.0, 1.7), 0.8)
+    value = 0.75 * ridges + 0.42 * fine
+    palette = [
+        [(-1.6, (22, 17, 13)), (-0.3, (66, 51, 40)), (0.6, (124, 104, 86)), (1.6, (186, 168, 146))],
+        [(-1.6, (28, 24, 21)), (-0.3, (74, 66, 58)), (0.6, (128, 119, 107)), (1.6, (196, 187, 172))],
+        [(-1.6, (34, 20, 12)), (-0.3, (96, 62, 42)), (0.6, (148, 104, 74)), (1.6, (206, 164, 126))],
+    ][seed % 3]
+    bgr = coloured(value, palette)  # type: ignore[arg-type]
+    moss = np.clip(0.8 * noise(rng, size, slope=1.4) - 0.9, 0, 1)[..., None]
+    bgr = bgr * (1 - moss) + moss * np.array([52, 118, 92]) * (0.8 + 0.25 * fine[..., None])
+    return finished(bgr)
+
+
+@cache
+def leaves(seed: int, size: int = 512) -> Texture:
+    """Foliage, one metre square: leaves of many greens over dark gaps."""
+    rng = np.random.default_rng([seed, 2])
+    canvas = coloured(noise(rng, size), [(-2.0, (14, 26, 10)), (2.0, (40, 62, 24))]).astype(np.uint8)
+    for layer in range(3):
+        for _ in range(900):
+            shade = rng.normal(0.62 + 0.19 * layer, 0.16)
+            colour = np.clip(shade * np.array([52, 150, 106]) + rng.normal(0, 9, 3), 0, 255)
+            axes = (int(rng.integers(7, 17)), int(rng.integers(3, 7)))
+            centre = rng.integers(0, size, 2)
+            _wrapped_ellipse(canvas, centre, axes, float(rng.uniform(0, 180)), colour)
+    light = 1.0 + 0.16 * noise(rng, size, slope=1.2)
+    return finished(canvas * light[..., None])
+
+
+def _wrapped_ellipse(canvas: Texels, centre: NDArray[np.int64], axes: tuple[int, int], angle: float, bgr: Field) -> None:
+    size = canvas.shape[0]
+    reach = max(axes)
+    for dx in (-size, 0, size):
+        for dy in (-size, 0, size):
+            x, y = int(centre[0] + dx), int(centre[1] + dy)
+            if -reach <= x < size + reach and -reach <= y < size + reach:
+                cv2.ellipse(canvas, (x, y), axes, angle, 0, 360, bgr.tolist(), -1, cv2.LINE_AA)
+
+
+@cache
+def grass(seed: int, size: int = 1024) -> Texture:
+    """Forest floor, three metres square: blades, dry leaves and bare earth."""
+    rng = np.random.default_rng([seed, 3])
+    earth = noise(rng, size, slope=0.9)
+    canvas = coloured(earth, [(-2.0, (34, 30, 16)), (0.0, (74, 82, 36)), (2.0, (128, 120, 70))]).astype(np.uint8)
+    density = noise(rng, size, slope=1.3)
+    for layer in range(4):
+        count = 4200
+        xy = rng.uniform(0, size, (count, 2))
+        angle, length = rng.normal(-np.pi / 2, 1.0, count), rng.uniform(9, 26, count)
+        shade = rng.normal(0.55 + 0.16 * layer, 0.17, count)
+        dry = rng.random(count) < 0.14
+        keep = density[xy[:, 1].astype(int), xy[:, 0].astype(int)] + rng.normal(0, 0.7, count) > -0.6
+        for k in np.flatnonzero(keep):
+            base = np.array([62, 150, 178]) if dry[k] else np.array([46, 152, 104])
+            tip = xy[k] + length[k] * np.array([np.cos(angle[k]), np.sin(angle[k])])
+            _wrapped_line(canvas, xy[k], tip, np.clip(shade[k] * base + rng.normal(0, 8, 3), 0, 255))
+    light = 1.0 + 0.2 * noise(rng, size, slope=1.1)
+    return finished(canvas * light[..., None])
+
+
+def _wrapped_line(canvas: Texels, start: Field, end: Field, bgr: Field) -> None:
+    size = canvas.shape[0]
+    for dx in (-size, 0, size):
+        for dy in (-size, 0, size):
+            a, b = start + (dx, dy), end + (dx, dy)
+            if min(a[0], b[0]) < size and max(a[0], b[0]) >= 0 and min(a[1], b[1]) < size and max(a[1], b[1]) >= 0:
+                ends = [tuple(int(c) for c in np.rint(16 * p)) for p in (a, b)]
+                cv2.line(canvas, ends[0], ends[1], bgr.tolist(), 1, cv2.LINE_AA, 4)
+
+
+@cache
+def dapple(seed: int, size: int = 256) -> Texture:
+    """Blotches of colour and of sun through leaves, for modulation; eight metres square."""
+    rng = np.random.default_rng([seed, 4])
+    tone = 128.0 + 13.0 * np.stack([noise(rng, size, slope=1.3) for _ in range(3)], axis=-1)
+    sun = np.clip(150 + 170 * noise(rng, size, (1.0, 0.6), 1.3), 25, 255)
+    return finished(tone, sun)
+
+
+@cache
+def sky(seed: int, size: int = 1024) -> Texture:
+    """A panorama: u the azimuth, v from the zenith (0) over the horizon (0.5) down; clouds and far woods."""
+    rng = np.random.default_rng([seed, 5])
+    elevation = (0.5 - (np.arange(size) + 0.5) / size)[:, None] * 180.0
+    blue = coloured(
+        np.broadcast_to(elevation, (size, size)),
+        [(-5, (196, 206, 208)), (2, (205, 216, 222)), (12, (172, 202, 230)), (40, (112, 165, 216)), (90, (74, 128, 196))],
+    )
+    cloud = np.clip(0.55 * noise(rng, size, (0.6, 2.2), 1.5) + 0.05, 0, 1)[..., None]
+    bgr = blue * (1 - 0.8 * cloud) + 0.8 * cloud * np.array([248, 244, 240])
+    crowns = 3.0 + 1.1 * noise(rng, size, slope=1.0)[:1]
+    woods = coloured(
+        noise(rng, size, slope=0.9),
+        [(-2, (106, 132, 116)), (0, (132, 156, 134)), (2, (158, 178, 150))],
+    )
+    bgr = np.where((elevation < crowns)[..., None], woods, bgr)
+    return finished(bgr)
