@@ -189,6 +189,7 @@ class VehicleConfig(Section):
 
     mission: str = Field("forest", min_length=1, description="name or path; the service flies this one")
     calibration: Path | None = Field(None, description="file made by `morpheyes calibrate solve`")
+    hold_baseline_mm: float | None = Field(None, ge=10, le=1000, description="hold this baseline, for comparisons")
     footprint: Footprint = Footprint()
     camera: CameraConfig
     servo: ServoConfig
@@ -200,7 +201,9 @@ class VehicleConfig(Section):
 
     @property
     def baseline_range_m(self) -> tuple[float, float]:
-        """Smallest and largest baseline the rig can take."""
+        """Smallest and largest baseline the mission may ask for."""
+        if self.hold_baseline_mm is not None:
+            return self.hold_baseline_mm / 1e3, self.hold_baseline_mm / 1e3
         if isinstance(self.servo, NoServoConfig):
             return self.servo.baseline_mm / 1e3, self.servo.baseline_mm / 1e3
         return self.servo.motion.min_baseline_mm / 1e3, self.servo.motion.max_baseline_mm / 1e3

@@ -83,9 +83,7 @@ class Pipeline:
 
     def __init__(self, config: VehicleConfig, mission: MissionFile, rig: RigModel) -> None:
         self._estimator = DepthEstimator(
-            rig.rescaled(config.camera.width_px, config.camera.height_px),
-            disparities_fraction=config.stereo.disparities_fraction,
-            sigma_disparity_px=config.stereo.sigma_disparity_px,
+            rig, config.stereo, (config.camera.width_px, config.camera.height_px)
         )
         self._strategy = build_strategy(mission, config)
         self._T_frd_rig = build_craft(config).T_frd_rig
@@ -93,16 +91,16 @@ class Pipeline:
     def perceive(self, job: VisionJob) -> Perception:
         """Return what one frame shows. Raises CalibrationError when the rig does not cover the frame's baseline."""
         started_s = stopwatch_s()
-        estimate = self._estimator.estimate(job.frame)
-        depth = estimate.depth
-        view = View(depth, estimate.left, estimate.right, job.vehicle, self._T_frd_rig)
+        pair = self._estimator.rectified(job.frame)
+        depth = self._estimator.depth(job.frame, pair)
+        view = View(depth, pair.left, pair.right, job.vehicle, self._T_frd_rig)
         percept = self._strategy.perceive(view)
         return Perception(
             summary=summarize(depth, stopwatch_s() - started_s),
             percept=percept,
             sectors_m=sectors(depth),
-            image_faults=estimate.faults,
-            left_rect=_small(estimate.left_colour) if job.keep_images else None,
+            image_faults=(),
+            left_rect=_small(job.frame.left) if job.keep_images else None,
             depth_m=frozen(depth.depth_m[::2, ::2].copy()) if job.keep_images else None,
         )
 

@@ -20,7 +20,7 @@ from morpheyes_daemon.errors import InputError, UsageError
 from morpheyes_daemon.messages import Image
 from morpheyes_daemon.transforms import Array
 
-_WINDOW_SHARE = 0.42
+_WINDOW_SHARE = 0.34
 """Half width of the sub-pixel window as a share of the distance to the nearest corner: the next edge stays out."""
 _WINDOW_LIMITS_PX = (2, 11)
 _REFINE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
@@ -47,15 +47,15 @@ class Board:
 
     def __post_init__(self) -> None:
         low, high = _SQUARE_LIMITS_M
-        if not 3 <= min(self.columns, self.rows) or max(self.columns, self.rows) > 60:
-            raise UsageError(f"A board of {self.columns}x{self.rows} inner corners cannot be used; give 3 to 60 each.")
+        if not min(self.columns, self.rows) >= 3 or max(self.columns, self.rows) > 60:
+            raise UsageError(f"A board of {self.columns}x{self.rows} inner corners cannot be used; give 3 to 60.")
         if not (math.isfinite(self.square_m) and low <= self.square_m <= high):
             raise UsageError(
                 f"A square of {self.square_m * 1e3:g} mm is not believable; "
                 f"measure one on the board and give 1 to 1000 mm."
             )
         if self.kind == "charuco" and not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
-            raise UsageError(f"There is no marker dictionary {self.dictionary!r}; use one such as 4X4_50 or 5X5_1000.")
+            raise UsageError(f"There is no marker dictionary {self.dictionary!r}; use one such as 5X5_1000.")
 
     @property
     def corner_count(self) -> int:

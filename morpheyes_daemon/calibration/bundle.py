@@ -9,6 +9,7 @@ nothing about files, rails or outliers.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,7 +56,7 @@ class Prior:
     def cost(self, shared: Array) -> float:
         """Return the quadratic's value."""
         away = shared - self.mean
-        return float(away @ self.information @ away)
+        return float(np.sum(away * (self.information @ away)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,7 @@ def noise_px(residual: Array, unknowns: int = 0) -> float:
     """Return the corner noise of one coordinate, from the median so that outliers do not count."""
     seen = np.abs(residual[np.isfinite(residual)])
     freedom = max(seen.size - unknowns, 1) / max(seen.size, 1)
-    return max(float(np.median(seen)) / 0.6745 / np.sqrt(freedom), 1e-6)
+    return max(float(np.median(seen)) / 0.6745 / math.sqrt(freedom), 1e-6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +160,7 @@ def _columns(baseline: np.ndarray[tuple[int], np.dtype[np.intp]]) -> np.ndarray[
 
 
 def _jacobian(observations: Observations, state: RigState) -> tuple[Array, Array]:
-    """Return d predicted / d (eyes, between, board) (V, 2, N, 2, 32) and the residual (V, 2, N, 2), 0 where unseen."""
+    """Return d predicted / d unknowns of a view (V, 2, N, 2, 32) and the residual (V, 2, N, 2), 0 where unseen."""
     p_cam0, p_cam1, arm, from_cam1 = _points(observations, state)
     views, corners = p_cam0.shape[:2]
     jacobian = np.zeros((views, 2, corners, 2, EYES + 2 * POSE))
@@ -190,7 +191,9 @@ def _turning(between: Array) -> tuple[Array, Array]:
     for r in between[:, :3]:
         angle = float(np.linalg.norm(r))
         cross = skew(r)
-        a, b = (0.5, 1.0 / 6.0) if angle < 1e-6 else ((1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3)
+        a, b = 0.5, 1.0 / 6.0
+        if angle > 1e-6:
+            a, b = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
         rotations.append(R_from_rotvec(-r))
         jacobians.append(np.eye(3) + a * cross + b * cross @ cross)
     return np.array(rotations), np.array(jacobians)

@@ -22,6 +22,8 @@ _SUSPECT = 4.0
 _LEAST_PX = 0.15
 """... and at least this much above it: with near-perfect pictures nothing is an outlier."""
 _FEWEST_CORNERS = 8
+_STRAY_SIGMAS = 8.0
+"""A single corner this far off was drawn to something else, a border or a glint."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,14 @@ def find_outliers(observations: Observations, solution: Solution) -> list[Outlie
             name = observations.names[view][eye]
             outliers.append(Outlier(int(view), eye, name, float(rms[view, eye])))
     return outliers
+
+
+def without_strays(observations: Observations, solution: Solution) -> tuple[Observations, int]:
+    """Return the observations without single corners that were drawn elsewhere, and how many those were."""
+    stray = np.linalg.norm(solution.residual_px, axis=-1) > _STRAY_SIGMAS * solution.sigma_px
+    left = np.where(stray[:, 0, :, None], np.nan, observations.left)
+    right = np.where(stray[:, 1, :, None], np.nan, observations.right)
+    return replace(observations, left=left, right=right), int(np.count_nonzero(stray))
 
 
 def without(observations: Observations, outliers: list[Outlier]) -> tuple[Observations, NDArray[np.bool_]]:

@@ -25,7 +25,7 @@ def camera_from_vector(parameters: Array, size: tuple[int, int]) -> CameraIntrin
 
 
 def project(p_cam: Array, camera: Array) -> tuple[Array, Array, Array]:
-    """Return pixels (..., 2) of points (..., 3), and their derivatives to camera (..., 2, 10) and point (..., 2, 3)."""
+    """Return pixels (..., 2) of points (..., 3), their derivatives to camera (..., 2, 10) and point (..., 2, 3)."""
     fx, fy, cx, cy, alpha, k1, k2, k3, k4, k5 = camera
     inv_z = 1.0 / p_cam[..., 2]
     x, y = p_cam[..., 0] * inv_z, p_cam[..., 1] * inv_z

@@ -7,14 +7,14 @@ this is measured against.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration import bundle
 from morpheyes_daemon.calibration.bundle import EYES, POSE, Prior, RigState, Solution
-from morpheyes_daemon.calibration.outliers import Outlier, find_outliers, without
+from morpheyes_daemon.calibration.outliers import Outlier, find_outliers, without, without_strays
 from morpheyes_daemon.calibration.rail import Rail, fit_rail, with_rail
 from morpheyes_daemon.calibration.start import first_guess
 from morpheyes_daemon.calibration.views import Observations, Progress, silent
@@ -36,7 +36,7 @@ class Calibration:
     solution: Solution
     rail: Rail | None
     outliers: tuple[Outlier, ...] = ()
-    problems: tuple[str, ...] = field(default=())
+    strays: int = 0
 
     @property
     def poses(self) -> Array:
@@ -70,12 +70,15 @@ def calibrate(observations: Observations, progress: Progress = silent) -> Calibr
     prior = camera_prior(kept, start)
     progress("joint solve", 1, 3)
     kept, solution, outliers = _robust(kept, start, prior)
+    kept, strays = without_strays(kept, solution)
+    if strays:
+        solution = bundle.solve(kept, solution.state, prior, solution.sigma_px)
     progress("learning the rail", 2, 3)
     rail = _rail(kept, solution)
     if rail is not None:
         solution = bundle.solve(kept, solution.state, with_rail(prior, rail), solution.sigma_px)
     progress("learning the rail", 3, 3)
-    return Calibration(kept, solution, rail, tuple(outliers), kept.problems)
+    return Calibration(kept, solution, rail, tuple(outliers), strays)
 
 
 def resolve(calibration: Calibration, keep: NDArray[np.bool_]) -> Calibration:

@@ -54,9 +54,10 @@ def board_pose(observations: Observations, view: int, eye: int, camera: CameraIn
         return None
     flags = cv2.SOLVEPNP_ITERATIVE
     found, turn, shift = cv2.solvePnP(points[straight], rays[straight], np.eye(3), None, flags=flags)
-    if not found or shift[2, 0] <= 0:
+    turn, shift = np.asarray(turn, dtype=np.float64).ravel(), np.asarray(shift, dtype=np.float64).ravel()
+    if not found or shift[2] <= 0:
         return None
-    return pose(R_from_rotvec(turn[:, 0]), shift[:, 0])
+    return pose(R_from_rotvec(turn), shift)
 
 
 def _camera(observations: Observations, eye: int) -> CameraIntrinsics:
@@ -65,7 +66,7 @@ def _camera(observations: Observations, eye: int) -> CameraIntrinsics:
     good = np.flatnonzero(counts >= min(observations.board.corner_count, 2 * _FEWEST_CORNERS))
     if len(good) < 3:
         name = "left" if eye == 0 else "right"
-        raise InputError(f"The {name} eye sees the board in only {len(good)} pictures; take at least ten per baseline.")
+        raise InputError(f"The {name} eye sees the board in only {len(good)} pictures; take ten per baseline.")
     chosen = good[np.unique(np.linspace(0, len(good) - 1, _VIEWS_PER_CAMERA).round().astype(int))]
     camera, error = _opencv(observations, pixels, chosen)
     sound = error <= _SUSPECT * np.median(error)
@@ -82,8 +83,9 @@ def _opencv(
     corners = [pixels[view][mask].astype(np.float32) for view, mask in zip(views, seen, strict=True)]
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     _, K, d, _, _, _, _, error = cv2.calibrateCameraExtended(
-        points, corners, observations.size, None, None, flags=flags
+        points, corners, observations.size, np.eye(3), np.zeros(5), flags=flags
     )
+    K, d, error = (np.asarray(a, dtype=np.float64) for a in (K, d, error))
     d = d.ravel()
     vector = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0.0, d[0], d[1], 0.0, 0.0, 0.0])
     return camera_from_vector(vector, observations.size), error.ravel()
@@ -94,7 +96,8 @@ def _between(
 ) -> Array:
     """Return T_cam0_cam1 of one baseline as (rotation vector, metres), the median over its views."""
     views = np.flatnonzero(observations.baseline == baseline)
-    poses = [left @ inverse(right) for v in views if (left := T_left[v]) is not None and (right := T_right[v]) is not None]
+    seen = [(T_left[view], T_right[view]) for view in views]
+    poses = [left @ inverse(right) for left, right in seen if left is not None and right is not None]
     if not poses:
         raise InputError(
             f"At {observations.nominal_m[baseline] * 1e3:g} mm no picture shows the board to both eyes; retake them."

@@ -244,7 +244,7 @@ def _left_right(files: list[Path], problems: list[str]) -> list[PairFiles]:
         left, right = eyes["left"].get(number), eyes["right"].get(number)
         if left is None or right is None:
             alone, other = (left, "right") if right is None else (right, "left")
-            problems.append(f"{alone}: has no {other} picture of the same number; copy it there or take the pair again.")
+            problems.append(f"{alone}: has no {other} picture of the same number; copy it there or retake the pair.")
         pairs.append(PairFiles(left, right))
     return pairs
 
@@ -263,7 +263,7 @@ def _detect(
 ) -> Iterator[_View]:
     """Yield the views in order; two threads, since OpenCV leaves the interpreter while it looks."""
     with ThreadPoolExecutor(max_workers=os.cpu_count() or 1) as pool:
-        for done, view in enumerate(pool.map(lambda job: _see(*job, board, cache), jobs), start=1):
+        for done, view in enumerate(pool.map(lambda job: _see(job[0], job[1], board, cache), jobs), start=1):
             progress("looking for the board", done, len(jobs))
             yield view
     cache.save()
@@ -363,14 +363,14 @@ def _assembled(
 ) -> Observations:
     counts = Counter(view.baseline for view in views if view.left is not None and view.right is not None)
     chosen = [number for number in range(len(folders)) if counts[number] >= _FEWEST_VIEWS]
+    root = folders[0].folder if len(folders) == 1 else folders[0].folder.parent
     if not chosen:
         raise InputError(
-            f"{folders[0].folder.parent if len(folders) > 1 else folders[0].folder}: the {board.label} board is found "
-            f"in too few pictures ({len(views)}); check the number of inner corners given by --board."
+            f"{root}: the {board.label} board is found in too few pictures ({len(views)}); check the number of inner "
+            "corners given by --board."
         )
     kept = [view for view in views if view.baseline in chosen]
     unseen = np.full((board.corner_count, 2), np.nan)
-    root = folders[0].folder if len(folders) == 1 else folders[0].folder.parent
     nominal = [folders[number].nominal_m for number in chosen]
     return Observations(
         board=board,

@@ -30,6 +30,9 @@ CACHED = 8
 """Rectifications kept; one at 640x480 takes 5 MB."""
 
 
+_NO_MAP: FloatMap = np.empty(0, dtype=np.float32)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RectifiedEye:
     """How one eye's raw image becomes the rectified one.
@@ -46,7 +49,9 @@ class RectifiedEye:
 
     def image(self, raw: Image) -> Image:
         """Return the rectified image (H, W) or (H, W, 3) of a raw one."""
-        return np.asarray(cv2.remap(raw, self.map_px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        return np.asarray(
+            cv2.remap(raw, self.map_px, _NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
+        )
 
     def points(self, uv: Array) -> Array:
         """Return the rectified pixels (..., 2) of raw ones, exactly; NaN where the lens cannot see."""
@@ -145,7 +150,7 @@ def homogeneous(xy: Array) -> Array:
 def pixels(pinhole: Pinhole, p_rect: Array) -> Array:
     """Return the pixels (..., 2) of points (..., 3) in the rectified frame."""
     xy = p_rect[..., :2] / p_rect[..., 2:3]
-    return pinhole.f_px * xy + np.array([pinhole.cx_px, pinhole.cy_px])
+    return np.asarray(pinhole.f_px * xy + np.array([pinhole.cx_px, pinhole.cy_px]))
 
 
 def rays(pinhole: Pinhole, uv: Array) -> Array:

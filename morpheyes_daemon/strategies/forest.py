@@ -56,6 +56,13 @@ class ForestParameters(StrategyParameters):
     look_rate_deg_s: float = Field(35.0, gt=1, le=90, description="yaw rate when looking around")
 
 
+ASTRAY_RAD = math.radians(75.0)
+"""A goal further off the nose than this lies behind."""
+
+FIRST_DETOUR_M = 4.0
+"""Flown away from the goal before turning back for the first time."""
+
+
 class Phase(StrEnum):
     """What the decider is doing."""
 
@@ -81,7 +88,10 @@ class Forest(Strategy):
         self._last_ns = 0
         self._heading_rad = 0.0
         self._look_sign = 1.0
-        self._looked_rad = 0.0
+        self._look_left_rad = 0.0
+        self._best_m = math.inf
+        self._detour_m = FIRST_DETOUR_M
+        self._strayed_m = 0.0
         self._seq = 0
 
     def perceive(self, view: View) -> ObstacleProfile:
@@ -97,7 +107,7 @@ class Forest(Strategy):
         profile: ObstacleProfile = observation.percept
         vehicle = observation.vehicle
         self._memory.add(profile)
-        if not observation.engaged:
+        if not observation.engaged or self._goal_ned_m is None:
             self._settle(vehicle)
         dt_s = min(2.0, max(1e-3, (observation.now_ns - self._last_ns) / S)) if self._last_ns else 0.2
         self._last_ns = observation.now_ns
@@ -109,9 +119,12 @@ class Forest(Strategy):
             return self._stop(observation, Intent.DONE, Reason.GOAL_REACHED)
         obstacles = self._obstacles(profile, observation)
         goal_rad = math.atan2(to_goal[1], to_goal[0])
+        if self._astray(wrap_rad(goal_rad - vehicle.yaw_rad), distance_m, vehicle, dt_s):
+            return self._look(observation, profile.near_limit_m, dt_s)
         choice = self._choose(profile, obstacles, observation, goal_rad, distance_m)
         if choice is None:
-            return self._look(profile, observation, goal_rad, dt_s)
+            self._start_looking(1.0 if _right_is_freer(profile) else -1.0, math.inf)
+            return self._look(observation, profile.near_limit_m, dt_s)
         return self._fly(choice, obstacles, observation, dt_s, distance_m)
 
     def _settle(self, vehicle: VehicleState) -> None:
@@ -197,7 +210,6 @@ class Forest(Strategy):
         heading, half_width, z_close = choice
         vehicle = observation.vehicle
         self._phase = Phase.FLY
-        self._looked_rad = 0.0
         vx, vy, _ = vehicle.v_ned_m_s
         speed = math.hypot(vx, vy)
         course = math.atan2(vy, vx) if speed > 0.5 else heading
@@ -223,20 +235,37 @@ class Forest(Strategy):
             {"heading_rad": heading, "drift_m": drift, "half_width_m": half_width},
         )
 
-    def _look(
-        self, profile: ObstacleProfile, observation: Observation, goal_rad: float, dt_s: float
-    ) -> MissionCommand:
-        """Nothing in view is free: stand still and turn until something is."""
+    def _astray(self, off_goal_rad: float, distance_m: float, vehicle: VehicleState, dt_s: float) -> bool:
+        """Tell whether it is time to turn back towards a goal that lies behind.
+
+        A detour may lead away for `_detour_m`; each turn back that brings the goal no nearer doubles it, so that a
+        pocket is left on a wider way the next time.
+        """
+        if self._phase is Phase.LOOK and math.isfinite(self._look_left_rad):
+            return self._look_left_rad > 0.0
+        if distance_m < self._best_m - 2.0:
+            self._best_m, self._detour_m = distance_m, FIRST_DETOUR_M
+        if abs(off_goal_rad) < ASTRAY_RAD:
+            self._strayed_m = 0.0
+            return False
+        self._strayed_m += math.hypot(vehicle.v_ned_m_s[0], vehicle.v_ned_m_s[1]) * dt_s
+        if self._strayed_m < self._detour_m:
+            return False
+        self._strayed_m, self._detour_m = 0.0, 2.0 * self._detour_m
+        self._start_looking(math.copysign(1.0, off_goal_rad), abs(off_goal_rad) - ASTRAY_RAD / 2)
+        return True
+
+    def _start_looking(self, sign: float, how_far_rad: float) -> None:
         if self._phase is not Phase.LOOK:
-            self._phase = Phase.LOOK
-            left, right = np.array_split(np.minimum(profile.range_m, profile.trust_m), 2)
-            self._look_sign = 1.0 if float(right.mean()) >= float(left.mean()) else -1.0
-            self._looked_rad = 0.0
-        turn = math.radians(self.parameters.look_rate_deg_s)
-        self._looked_rad += turn * dt_s
+            self._phase, self._look_sign, self._look_left_rad = Phase.LOOK, sign, how_far_rad
+
+    def _look(self, observation: Observation, near_limit_m: float, dt_s: float) -> MissionCommand:
+        """Stand still and turn, to find a free direction or back towards the goal."""
+        rate = math.radians(self.parameters.look_rate_deg_s)
+        self._look_left_rad -= rate * dt_s
         self._heading_rad = observation.vehicle.yaw_rad
-        self._follow(profile.near_limit_m, dt_s)
-        yaw_rad = wrap_rad(observation.vehicle.yaw_rad + self._look_sign * min(1.0, turn * 1.0))
+        self._follow(near_limit_m, dt_s)
+        yaw_rad = wrap_rad(observation.vehicle.yaw_rad + self._look_sign * rate)
         return self._command(
             observation, Intent.STOP, Reason.NO_FREE_PATH, (0.0, 0.0, 0.0), yaw_rad, 0.0, self._z_close_m, {}
         )
@@ -280,6 +309,11 @@ class Forest(Strategy):
             z_close_m=z_close_m,
             detail=detail,
         )
+
+
+def _right_is_freer(profile: ObstacleProfile) -> bool:
+    left, right = np.array_split(np.minimum(profile.range_m, profile.trust_m), 2)
+    return float(right.mean()) >= float(left.mean())
 
 
 def _wide(flags: np.ndarray[tuple[int], np.dtype[np.bool_]], least: int = 3) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -1,0 +1,260 @@
+"""The composition root, the one file that knows everybody: config to devices to topics to tasks to supervisor.
+
+Real, simulated and replayed daemons differ in the `Parts` they are given and in nothing else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from morpheyes_daemon.bus import EventLog, Topics
+from morpheyes_daemon.clock import Clock, S
+from morpheyes_daemon.config import MissionFile, NoServoConfig, VehicleConfig
+from morpheyes_daemon.control.baseline import BaselineModel, FixedBaseline
+from morpheyes_daemon.control.baseline_planner import BaselinePlanner
+from morpheyes_daemon.control.flight_control import FlightControl
+from morpheyes_daemon.control.governor import Governor, GovernorLimits
+from morpheyes_daemon.control.loiter import LoiterModel
+from morpheyes_daemon.control.vehicle_track import VehicleTrack
+from morpheyes_daemon.control.velocity import VelocityTuning
+from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
+from morpheyes_daemon.devices.camera import Camera
+from morpheyes_daemon.devices.link import LinkOpener
+from morpheyes_daemon.devices.servo import Servo
+from morpheyes_daemon.errors import DeviceError
+from morpheyes_daemon.messages import Event, Perception, VehicleState
+from morpheyes_daemon.perception import VisionJob, build_strategy
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.safety.gate import Gate, GateOutput, StickLimits
+from morpheyes_daemon.safety.guardian import Guardian, GuardianLimits
+from morpheyes_daemon.safety.states import Action, State, Transition
+from morpheyes_daemon.supervisor.supervisor import Supervisor, Task
+from morpheyes_daemon.supervisor.worker import VisionWorker
+from morpheyes_daemon.tasks.baseline import baseline
+from morpheyes_daemon.tasks.capture import capture
+from morpheyes_daemon.tasks.depth import depth
+from morpheyes_daemon.tasks.health import Health, health
+from morpheyes_daemon.tasks.mission import mission
+from morpheyes_daemon.tasks.obstacles import obstacles
+from morpheyes_daemon.tasks.sticks import sticks
+from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride
+
+STATE_NUMBERS: dict[State, int] = {state: number for number, state in enumerate(State)}
+"""What NAMED_VALUE_INT carries for a state."""
+
+
+@dataclass(slots=True)
+class Parts:
+    """What differs between the real, the simulated and the replayed daemon."""
+
+    clock: Clock
+    camera: Camera
+    servo: Servo
+    opener: LinkOpener
+    worker: VisionWorker[VisionJob, Perception]
+    image_rate_hz: float = 0.0
+    tell: Callable[[Health], None] = lambda report: None
+
+
+class Daemon:
+    """One mission on one vehicle. `run` is the daemon's life; topics and events are for recorder and dashboard."""
+
+    def __init__(
+        self, config: VehicleConfig, mission_file: MissionFile, parts: Parts, topics: Topics, events: EventLog
+    ) -> None:
+        self.config = config
+        self.topics = topics
+        self.events = events
+        self.track = VehicleTrack()
+        self._parts = parts
+        self._clock = parts.clock
+        self._strategy = build_strategy(mission_file, config)
+        self.hub = AutopilotHub(config.autopilot, parts.clock, topics, events, parts.opener)
+        self._send = self.hub.claim_stick_output()
+        self.gate = Gate(self._output)
+        self.guardian = Guardian(self.gate, guardian_limits(config), self._on_transition)
+        self.control: FlightControl | None = None
+        self._governor = Governor(governor_limits(config))
+        self._model = BaselineModel(config.servo.motion) if not isinstance(config.servo, NoServoConfig) else None
+        fixed_m = config.baseline_range_m[0]
+        self._where = self._model or FixedBaseline(fixed_m)
+        self.hub.on_vehicle(self._on_vehicle)
+        self.hub.parameters.on_change(self._on_parameters)
+        self.supervisor = Supervisor(
+            self._tasks(), self.guardian, events, parts.clock, config.safety.supervisor_timeout_s
+        )
+
+    @property
+    def stopping(self) -> LoiterModel | None:
+        """How the vehicle brakes, None before its parameters are known."""
+        return self.control.model if self.control else None
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Live until `stop` is set, then neutral, release and end. Every way out sends a release."""
+        await self._parts.worker.start()
+        self.guardian.set_missing(None)
+        running = asyncio.create_task(self.supervisor.run(), name="supervisor")
+        stopping = asyncio.create_task(stop.wait(), name="stop")
+        try:
+            self.guardian.boot_done(self._clock.now_ns())
+            await asyncio.wait({running, stopping}, return_when=asyncio.FIRST_COMPLETED)
+            if not running.done():
+                await self._leave()
+        finally:
+            self.guardian.release_now(Reason.SHUTDOWN, self._clock.now_ns())
+            for task in (running, stopping):
+                task.cancel()
+            results = await asyncio.gather(running, stopping, return_exceptions=True)
+            await self._parts.worker.close()
+        failure = results[0]
+        if isinstance(failure, Exception):
+            raise failure
+
+    async def _leave(self) -> None:
+        """Neutral for a while if we hold the sticks, then the release, repeated by the gate."""
+        self.guardian.shutdown(self._clock.now_ns())
+        held = self.topics.gate.get()
+        while not self.guardian.let_go:
+            await self._clock.sleep_until_ns(self._clock.now_ns() + S // 50)
+        if held is not None and held.action is not Action.SILENT:
+            await self._clock.sleep_until_ns(self._clock.now_ns() + S // 5)
+
+    def _tasks(self) -> list[Task]:
+        """The task table: name, loop, the reason its death is given, and whether flight needs it."""
+        config, parts, clock, topics = self.config, self._parts, self._clock, self.topics
+        gate, guardian, safety = self.gate, self.guardian, config.safety
+        period_ns = round(S / config.camera.rate_hz)
+        reaction_s = safety.dead_daemon_s
+        frame_ns = round(safety.frame_periods * period_ns)
+        depth_ns = round(safety.depth_periods * period_ns)
+        table = [
+            Task("autopilot", lambda pulse: self.hub.run(), Reason.LINK_LOST),
+            Task(
+                "sticks",
+                lambda pulse: sticks(
+                    self, self.track, guardian, topics, self.events, clock, config.autopilot.stick_rate_hz, pulse
+                ),
+                Reason.TASK_DIED,
+            ),
+            Task(
+                "capture",
+                lambda pulse: capture(parts.camera, self._where, topics.frame, gate, frame_ns, pulse),
+                Reason.CAMERA_LOST,
+            ),
+            Task(
+                "depth",
+                lambda pulse: depth(
+                    parts.worker,
+                    self.track,
+                    topics,
+                    self.events,
+                    gate,
+                    clock,
+                    depth_ns + round(config.stereo.latency_ms * 1e6),
+                    parts.image_rate_hz,
+                    pulse,
+                ),
+                Reason.WORKER_LOST,
+            ),
+            Task(
+                "mission",
+                lambda pulse: mission(
+                    self._strategy, self.track, self, guardian, topics, clock, reaction_s, pulse
+                ),
+                Reason.TASK_DIED,
+            ),
+            Task(
+                "health",
+                lambda pulse: health(self.supervisor, guardian, topics, clock, self._tell, pulse),
+                Reason.TASK_DIED,
+                essential=False,
+            ),
+        ]
+        if config.autopilot.publish_obstacles:
+            table.append(
+                Task(
+                    "obstacles",
+                    lambda pulse: obstacles(self.hub, topics, gate, clock, pulse),
+                    Reason.TASK_DIED,
+                    essential=False,
+                )
+            )
+        if self._model is not None and not isinstance(config.servo, NoServoConfig):
+            model, planner = self._model, BaselinePlanner(config.servo.motion)
+            first_m = config.baseline_range_m[0]
+            table.append(
+                Task(
+                    "baseline",
+                    lambda pulse: baseline(parts.servo, model, planner, first_m, topics, clock, pulse),
+                    Reason.SERVO_LOST,
+                )
+            )
+        return table
+
+    def _on_vehicle(self, vehicle: VehicleState) -> None:
+        self.guardian.on_vehicle(vehicle, self._clock.now_ns())
+        self.track.add(vehicle)
+
+    def _on_parameters(self, values: Mapping[str, float]) -> None:
+        """The autopilot's own numbers, new: how it flies and where its sticks end."""
+        try:
+            model = LoiterModel.from_parameters(values)
+        except DeviceError as error:
+            self.events.publish(Event(self._clock.now_ns(), "autopilot", Reason.DOCTOR_SAYS_NO, str(error)))
+            return
+        lean_rad = min(self.config.safety.max_lean_deg * 0.0174533, model.lean_max_rad)
+        self.control = FlightControl(model, self._governor, VelocityTuning(max_lean_rad=lean_rad))
+        self.gate.set_limits(StickLimits(model.minimum, model.maximum, model.neutral))
+
+    def _output(self, out: GateOutput) -> None:
+        """The gate's output, in the order of the radio's channels."""
+        if out.action is Action.RELEASE or self.control is None:
+            self._send(RELEASE)
+        else:
+            self._send(ChannelOverride(self.control.model.channels(out.widths_us)))
+
+    def _on_transition(self, step: Transition) -> None:
+        text = f"{step.before} to {step.after}: {step.reason.text}"
+        self.events.publish(Event(step.t_ns, "guardian", step.reason, text))
+        severity = 4 if step.after in (State.BRAKING, State.HOLD, State.FAULT) else 6
+        self.hub.send_statustext(severity, f"MorphEyes {step.after}: {step.reason}")
+
+    def _tell(self, report: Health) -> None:
+        """Into the autopilot's own log: state, reason, baseline, nearest depth, frame age."""
+        self.hub.send_named_int("me_state", STATE_NUMBERS[report.state])
+        self.hub.send_named_int("me_reason", report.reason.number)
+        estimate, seen = self.topics.baseline.get(), self.topics.perception.get()
+        if estimate is not None:
+            self.hub.send_named_float("me_base", estimate.baseline_m)
+        if seen is not None:
+            self.hub.send_named_float("me_near", seen.summary.nearest_m)
+        self.hub.send_named_float("me_age", report.ages_s["frame"])
+        with contextlib.suppress(OSError):
+            self._parts.tell(report)
+
+
+def guardian_limits(config: VehicleConfig) -> GuardianLimits:
+    """Return the ages the guardian goes by."""
+    return GuardianLimits(
+        vehicle_timeout_s=config.safety.vehicle_timeout_s,
+        switch_timeout_s=config.safety.switch_timeout_s,
+        link_timeout_s=config.autopilot.link_timeout_s,
+        neutral_before_release_s=config.safety.neutral_before_release_s,
+        engage_channel=config.autopilot.engage_channel,
+        engage_above_us=config.autopilot.engage_above_us,
+    )
+
+
+def governor_limits(config: VehicleConfig) -> GovernorLimits:
+    """Return the governor's bounds."""
+    return GovernorLimits(
+        dead_daemon_s=config.safety.dead_daemon_s,
+        depth_sigmas=config.safety.depth_sigmas,
+        max_relative_depth_error=config.safety.max_relative_depth_error,
+        max_speed_m_s=config.safety.max_speed_m_s,
+        sync_error_s=config.camera.sync_error_ms / 1e3,
+        image_width_px=config.camera.width_px,
+    )

@@ -1,0 +1,133 @@
+"""How good is it, asked of pictures that the solve did not see.
+
+Held out: every view is left out once and its rows are compared after rectification with what the other views gave.
+Leave one baseline out: everything taken at an inner baseline is left out, its geometry interpolated from its
+neighbours as the daemon does it, and compared with the full solve on the same boards. Both start from the full
+solution, so they cost little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from morpheyes_daemon.calibration.projection import camera_from_vector
+from morpheyes_daemon.calibration.rectified import StereoGeometry, infinity_px, row_error_px
+from morpheyes_daemon.calibration.solver import Calibration, resolve
+from morpheyes_daemon.calibration.views import Progress, silent
+from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.transforms import Array
+
+_FOLDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Row errors of all held-out corners that both eyes saw.
+
+    `row_px` (n,), signed; `left_px` (n, 2) where in the left image; `baseline` (n,) which baseline; `median_px` and
+    `p95_px` of the absolute row error.
+    """
+
+    row_px: Array
+    left_px: Array
+    baseline: np.ndarray[tuple[int], np.dtype[np.intp]]
+
+    @property
+    def median_px(self) -> float:
+        """Median of the absolute row error."""
+        return float(np.median(np.abs(self.row_px)))
+
+    @property
+    def p95_px(self) -> float:
+        """95th percentile of the absolute row error."""
+        return float(np.percentile(np.abs(self.row_px), 95))
+
+
+@dataclass(frozen=True)
+class LeftOutBaseline:
+    """One inner baseline predicted by the others; `full_epipolar_median_px` is the full solve on the same boards."""
+
+    baseline_mm: float
+    epipolar_median_px: float
+    full_epipolar_median_px: float
+    baseline_error_mm: float
+    disparity_bias_px: float
+
+
+def geometry_at(calibration: Calibration, index: int) -> StereoGeometry:
+    """Return the solved geometry at one of the calibrated baselines."""
+    eyes, size = calibration.solution.state.eyes, calibration.observations.size
+    cam0, cam1 = camera_from_vector(eyes[0], size), camera_from_vector(eyes[1], size)
+    return StereoGeometry(cam0, cam1, calibration.poses[index])
+
+
+def held_out(calibration: Calibration, progress: Progress = silent) -> HeldOut:
+    """Return the row errors of every view under a solve that did not see it (four folds)."""
+    observations = calibration.observations
+    fold = _folds(observations.baseline, len(observations.nominal_m))
+    rows, places, baselines = [], [], []
+    for number in range(_FOLDS):
+        progress("held-out boards", number, _FOLDS)
+        part = resolve(calibration, fold != number)
+        for index, nominal in enumerate(part.observations.nominal_m):
+            full = index if np.isnan(nominal) else int(np.flatnonzero(observations.nominal_m == nominal)[0])
+            views = (fold == number) & (observations.baseline == full)
+            row, left = _row_errors(calibration, views, geometry_at(part, index))
+            rows.append(row)
+            places.append(left)
+            baselines.append(np.full(len(row), full, dtype=np.intp))
+    progress("held-out boards", _FOLDS, _FOLDS)
+    return HeldOut(np.concatenate(rows), np.concatenate(places), np.concatenate(baselines))
+
+
+def leave_one_out(calibration: Calibration, progress: Progress = silent) -> list[LeftOutBaseline]:
+    """Return for each inner baseline how well the others predict it; empty for fewer than three baselines."""
+    count = len(calibration.nominal_m)
+    results = []
+    for index in range(1, count - 1):
+        progress("leaving one baseline out", index - 1, count - 2)
+        results.append(_left_out(calibration, index))
+    if count > 2:
+        progress("leaving one baseline out", count - 2, count - 2)
+    return results
+
+
+def _left_out(calibration: Calibration, index: int) -> LeftOutBaseline:
+    views = calibration.observations.baseline == index
+    rest = resolve(calibration, ~views)
+    nominal_m = float(calibration.nominal_m[index])
+    eyes = [camera_from_vector(eye, rest.observations.size) for eye in rest.solution.state.eyes]
+    T = RigModel.from_poses(eyes[0], eyes[1], rest.nominal_m.tolist(), list(rest.poses)).T_cam0_cam1(nominal_m)
+    predicted, full = StereoGeometry(eyes[0], eyes[1], T), geometry_at(calibration, index)
+    return LeftOutBaseline(
+        baseline_mm=nominal_m * 1e3,
+        epipolar_median_px=float(np.median(np.abs(_row_errors(calibration, views, predicted)[0]))),
+        full_epipolar_median_px=float(np.median(np.abs(_row_errors(calibration, views, full)[0]))),
+        baseline_error_mm=abs(predicted.length_m - full.length_m) * 1e3,
+        disparity_bias_px=abs(float(np.median(infinity_px(predicted, full)))),
+    )
+
+
+def _row_errors(
+    calibration: Calibration, views: np.ndarray[tuple[int], np.dtype[np.bool_]], geometry: StereoGeometry
+) -> tuple[Array, Array]:
+    """Return the row error (n,) and left pixel (n, 2) of all corners that both eyes saw in the chosen views."""
+    left = calibration.observations.left[views].reshape(-1, 2)
+    right = calibration.observations.right[views].reshape(-1, 2)
+    seen = np.isfinite(left[:, 0]) & np.isfinite(right[:, 0])
+    row = row_error_px(geometry, left[seen], right[seen])
+    usable = np.isfinite(row)
+    return row[usable], left[seen][usable]
+
+
+def _folds(baseline: np.ndarray[tuple[int], np.dtype[np.intp]], count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    """Deal the views of each baseline out to the folds in turn; the turn goes on from baseline to baseline."""
+    fold = np.empty(len(baseline), dtype=np.intp)
+    dealt = 0
+    for number in range(count):
+        views = np.flatnonzero(baseline == number)
+        fold[views] = (dealt + np.arange(len(views))) % _FOLDS
+        dealt += len(views)
+    return fold

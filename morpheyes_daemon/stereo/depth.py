@@ -1,0 +1,154 @@
+"""Depth with its uncertainty from a stereo frame: Z = b f / d, unknown kept unknown.
+
+Ties rectification and matching together. What a depth means for the flight, and what to do where there is none, is
+decided elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morpheyes_daemon.config import StereoConfig
+from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.messages import DepthMap, FloatMap, Image, StereoFrame, frozen
+from morpheyes_daemon.stereo.matching import Match, MatchSettings, disparity_range, match
+from morpheyes_daemon.stereo.rectify import Rectification, Rectifier
+from morpheyes_daemon.stereo.rig import RigModel
+
+Depth = TypeVar("Depth", float, NDArray[np.float64], FloatMap)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RectifiedPair:
+    """Both rectified grey images (H, W) uint8 and how they were made."""
+
+    left: Image
+    right: Image
+    rectification: Rectification
+
+
+class DepthEstimator:
+    """Stereo frames to depth maps for one rig; `size` (width, height) of the images, None: the rig's own."""
+
+    def __init__(
+        self,
+        rig: RigModel,
+        config: StereoConfig | None = None,
+        size: tuple[int, int] | None = None,
+        settings: MatchSettings | None = None,
+    ) -> None:
+        self.rectifier = Rectifier(rig, size)
+        self.calibration_hash = rig.hash
+        self.config = config or StereoConfig()
+        self.settings = settings or MatchSettings()
+
+    @property
+    def rig(self) -> RigModel:
+        """The rig at the size of the images."""
+        return self.rectifier.rig
+
+    def estimate(self, frame: StereoFrame, near_m: float | None = None) -> DepthMap:
+        """Return the depth map of a raw frame; see `rectified` and `depth`, which it runs one after the other."""
+        return self.depth(frame, self.rectified(frame), near_m)
+
+    def rectified(self, frame: StereoFrame) -> RectifiedPair:
+        """Return the rectified grey pair. Raises InputError on a wrong size, CalibrationError outside the range."""
+        left, right = grey(frame.left), grey(frame.right)
+        width, height = self.rig.size
+        if left.shape != (height, width) or right.shape != (height, width):
+            raise InputError(
+                f"The images are {left.shape[1]}x{left.shape[0]} px, but {width}x{height} px were expected; "
+                "set the camera's size in the configuration."
+            )
+        rectification = self.rectifier.at(frame.baseline.baseline_m)
+        return RectifiedPair(*rectification.pair(left, right), rectification)
+
+    def depth(self, frame: StereoFrame, pair: RectifiedPair, near_m: float | None = None) -> DepthMap:
+        """Return the depth map of a rectified pair.
+
+        `near_m` searches only as far as needed to see that near (paper-notes 10); None takes the configured share of
+        the image width.
+        """
+        rectification = pair.rectification
+        baseline_m = self.rig.length_m(frame.baseline.baseline_m)
+        count = self._disparities(baseline_m, rectification.pinhole.f_px, near_m)
+        found = match(
+            pair.left,
+            pair.right,
+            count,
+            self.settings,
+            left_seen=rectification.cam0.seen,
+            right_seen=rectification.cam1.seen,
+        )
+        return self._depth_map(frame, rectification, found, baseline_m)
+
+    def _disparities(self, baseline_m: float, f_px: float, near_m: float | None) -> int:
+        width = self.rig.size[0]
+        most = disparity_range(self.config.disparities_fraction * width - 1, width)
+        return most if near_m is None else min(most, disparity_range(baseline_m * f_px / near_m, width))
+
+    def _depth_map(self, frame: StereoFrame, rectified: Rectification, found: Match, baseline_m: float) -> DepthMap:
+        nominal_m, f_px = frame.baseline.baseline_m, rectified.pinhole.f_px
+        depth_m = depth_from_disparity(found.disparity_px, baseline_m, f_px)
+        yaw_px = f_px * self.rig.sigma_yaw_rad(nominal_m)
+        return DepthMap(
+            seq=frame.seq,
+            t_ns=frame.t_ns,
+            depth_m=frozen(depth_m),
+            near=frozen(found.near),
+            one_eyed=frozen(found.one_eyed),
+            pinhole=rectified.pinhole,
+            T_rig_rect=rectified.T_rig_rect,
+            baseline_m=baseline_m,
+            baseline_sigma_m=math.hypot(frame.baseline.sigma_m, self.rig.sigma_length_m(nominal_m)),
+            sigma_disparity_px=math.hypot(self.config.sigma_disparity_px, yaw_px),
+            near_limit_m=near_limit_m(baseline_m, f_px, found.ceiling_px),
+            valid_fraction=float(np.isfinite(depth_m).mean()),
+            ceiling_fraction=float(found.near.mean()),
+            calibration_hash=self.calibration_hash,
+        )
+
+
+def depth_from_disparity(disparity_px: FloatMap, baseline_m: float, f_px: float, doffs_px: float = 0.0) -> FloatMap:
+    """Return Z = b f / (d + doffs) (H, W) float32 metres, NaN where the disparity is unknown or Z is not finite.
+
+    `doffs_px` is the difference of the principal points where a data set did not make them equal.
+    """
+    total = disparity_px + np.float32(doffs_px)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(total > 0, np.float32(baseline_m * f_px) / total, np.float32(np.nan))
+
+
+def near_limit_m(baseline_m: float, f_px: float, ceiling_px: float, doffs_px: float = 0.0) -> float:
+    """Return Z_min = b f / numDisparities, nearer than which nothing has a depth (paper-notes 11)."""
+    return baseline_m * f_px / (ceiling_px + doffs_px)
+
+
+def depth_sigma(
+    depth_m: Depth,
+    baseline_m: float,
+    f_px: float,
+    sigma_disparity_px: float,
+    baseline_sigma_m: float = 0.0,
+    yaw_sigma_rad: float = 0.0,
+) -> Depth:
+    """Return one sigma of a depth, metres: eps_z = z^2 eps_d / (b f) (paper, section II) and what else moves it.
+
+    A baseline wrong by a share moves the depth by that share; a yaw between the eyes moves the disparity by f per
+    radian. The three are independent and added in squares.
+    """
+    error_px = math.hypot(sigma_disparity_px, f_px * yaw_sigma_rad)
+    share = baseline_sigma_m / baseline_m
+    relative = ((depth_m * (error_px / (baseline_m * f_px))) ** 2 + share**2) ** 0.5
+    return depth_m * relative
+
+
+def grey(image: Image) -> Image:
+    """Return an image (H, W) or BGR (H, W, 3) as grey (H, W)."""
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)

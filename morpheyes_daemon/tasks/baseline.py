@@ -1,0 +1,48 @@
+"""The baseline the mission wants, to the servo; and the modelled baseline for everybody."""
+
+from __future__ import annotations
+
+from morpheyes_daemon.bus import Topics
+from morpheyes_daemon.clock import Clock, Ticker
+from morpheyes_daemon.control.baseline import BaselineModel
+from morpheyes_daemon.control.baseline_planner import BaselinePlanner
+from morpheyes_daemon.devices.servo import Servo
+from morpheyes_daemon.errors import DeviceError
+from morpheyes_daemon.supervisor.supervisor import Pulse
+
+RATE_HZ = 10.0
+
+
+async def baseline(
+    servo: Servo,
+    model: BaselineModel,
+    planner: BaselinePlanner,
+    first_m: float,
+    topics: Topics,
+    clock: Clock,
+    pulse: Pulse,
+) -> None:
+    """Keep the servo where the mission wants it (`first_m` before it has spoken); raises the servo's DeviceError."""
+    try:
+        await servo.open()
+        ticker = Ticker(clock, RATE_HZ)
+        while True:
+            command = topics.command.get()
+            target_m = planner.plan(command.baseline_m if command else first_m, model.at(clock.now_ns()))
+            if target_m is not None:
+                await _move(servo, model, target_m, clock)
+            topics.baseline.publish(model.at(clock.now_ns()))
+            pulse.beat()
+            await ticker.wait()
+    finally:
+        await servo.close()
+
+
+async def _move(servo: Servo, model: BaselineModel, target_m: float, clock: Clock) -> None:
+    sent_ns = clock.now_ns()
+    try:
+        await servo.move(target_m)
+    except DeviceError:
+        model.doubt(target_m, sent_ns)
+        raise
+    model.command(target_m, clock.now_ns())

@@ -1,0 +1,76 @@
+"""Ages, rates and lateness of everything, for the log, the page, the autopilot's log and systemd."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+from morpheyes_daemon.bus import Topics
+from morpheyes_daemon.clock import MS, Clock, S, Ticker
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.safety.guardian import Guardian
+from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.supervisor.supervisor import Pulse, Supervisor
+
+RATE_HZ = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """`ages_s` since each topic's newest message, `rates_hz` over the last period, `restarts` per task."""
+
+    t_ns: int
+    state: State
+    reason: Reason
+    missing: Reason | None
+    ages_s: dict[str, float]
+    rates_hz: dict[str, float]
+    restarts: dict[str, int]
+    lateness_ms: float
+    worst_lateness_ms: float
+
+
+async def health(
+    supervisor: Supervisor,
+    guardian: Guardian,
+    topics: Topics,
+    clock: Clock,
+    tell: Callable[[Health], None],
+    pulse: Pulse,
+) -> None:
+    """Publish a `Health` four times a second and hand it to `tell` (the autopilot's log and systemd)."""
+    ticker = Ticker(clock, RATE_HZ)
+    counts = dict.fromkeys((f.name for f in fields(topics)), 0)
+    worst_ms = 0.0
+    before_ns = clock.now_ns()
+    while True:
+        late_ms = (await ticker.wait()) / MS
+        worst_ms = max(worst_ms, late_ms)
+        now_ns = clock.now_ns()
+        elapsed_s = max(1e-3, (now_ns - before_ns) / S)
+        rates = {name: (getattr(topics, name).count - count) / elapsed_s for name, count in counts.items()}
+        counts = {name: getattr(topics, name).count for name in counts}
+        before_ns = now_ns
+        report = Health(
+            t_ns=now_ns,
+            state=guardian.state,
+            reason=guardian.reason,
+            missing=guardian.missing,
+            ages_s={name: _age_s(getattr(topics, name).get(), now_ns) for name in counts},
+            rates_hz=rates,
+            restarts={task.name: task.restarts for task in supervisor.tasks},
+            lateness_ms=late_ms,
+            worst_lateness_ms=worst_ms,
+        )
+        topics.health.publish(report)
+        tell(report)
+        pulse.beat()
+
+
+def _age_s(value: object, now_ns: int) -> float:
+    """Age of a message by its own stamp; NaN before the first."""
+    stamp = getattr(value, "t_ns", None) or getattr(getattr(value, "summary", None), "t_ns", None)
+    return (now_ns - stamp) / S if stamp else math.nan
+
+
