@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 from morpheyes_daemon.control import parameters as p
 from morpheyes_daemon.control.stopping import G_M_S2, Brake, StoppingTable
@@ -165,7 +166,7 @@ class LoiterModel:
             raise DeviceError("LOIT_SPEED, LOIT_BRK_JERK, ANGLE_MAX and PILOT_SPEED_UP must be positive: set them.")
         on_flow = round(p.VELOCITY_SOURCE.read(parameters)) == p.OPTICAL_FLOW
         flow = max(0.0, p.FLOW_RATE.read(parameters) - 1.0) if on_flow else None
-        table = StoppingTable(_limit_grid(limit) if on_flow else [limit], lean_max, brake)
+        table = _stopping_table(tuple(_limit_grid(limit) if on_flow else [limit]), lean_max, brake)
         rate = p.PILOT_Y_RATE.read(parameters)
         return cls(axes[0], axes[1], throttle, axes[3], limit, lean_max, rate, flow, brake, table)
 
@@ -258,6 +259,12 @@ def _mapped_axes(parameters: Mapping[str, float]) -> tuple[StickAxis, StickAxis,
         raise DeviceError(f"RCMAP_* put the sticks on channels {numbers}: they must be on channels 1 to 4.")
     roll, pitch, throttle, yaw = (StickAxis.from_parameters(parameters, number) for number in numbers)
     return roll.require_centred(), pitch.require_centred(), throttle, yaw.require_centred()
+
+
+@lru_cache(maxsize=4)
+def _stopping_table(limits_m_s: tuple[float, ...], lean_max_rad: float, brake: Brake) -> StoppingTable:
+    """The autopilot changes parameters of its own in flight; those that matter here seldom do."""
+    return StoppingTable(list(limits_m_s), lean_max_rad, brake)
 
 
 def _limit_grid(limit_m_s: float) -> list[float]:

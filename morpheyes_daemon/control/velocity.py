@@ -16,6 +16,9 @@ from morpheyes_daemon.control.stopping import G_M_S2
 from morpheyes_daemon.messages import Sticks, VehicleState
 from morpheyes_daemon.transforms import wrap_rad
 
+Vector2 = tuple[float, float]
+"""North and east, or forward and right."""
+
 STANDSTILL_M_S = 0.05
 """A wanted speed below this is a stop: neutral sticks, and Loiter holds the place by itself."""
 RANGEFINDER_FRESH_S = 0.5
@@ -60,12 +63,14 @@ class VelocityController:
         self.tuning = tuning = tuning or VelocityTuning()
         gains = PidGains(tuning.response_1_s, tuning.integral_1_s2, i_limit=tuning.integral_limit_m_s2)
         self._north, self._east = Pid(gains), Pid(gains)
+        self._felt: Vector2 = (0.0, 0.0)
         self._last_ns = 0
 
     def reset(self) -> None:
-        """Forget the integrals."""
+        """Forget the integrals and what was commanded."""
         self._north.reset()
         self._east.reset()
+        self._felt = (0.0, 0.0)
         self._last_ns = 0
 
     def step(
@@ -82,7 +87,11 @@ class VelocityController:
         With a height the wanted vertical speed is ignored. `coast` keeps pitch and roll neutral.
         """
         above_m = height_above_ground_m(vehicle, now_ns)
-        roll_us, pitch_us = self._lean_sticks(now_ns, v_ned_m_s, vehicle, above_m, coast)
+        dt_s = min(0.1, max(0.001, (now_ns - self._last_ns) / S)) if self._last_ns else 0.02
+        self._last_ns = now_ns
+        push = None if coast else self._push(now_ns, dt_s, v_ned_m_s, vehicle, above_m)
+        self._feel(push or (0.0, 0.0), dt_s)
+        roll_us, pitch_us = self._lean_sticks(push, vehicle.yaw_rad)
         climb = -v_ned_m_s[2] if height_m is None else self._climb_m_s(height_m - above_m)
         rate = 0.0 if yaw_rad is None else self._yaw_rate_rad_s(wrap_rad(yaw_rad - vehicle.yaw_rad))
         expires_ns = now_ns + round(self.tuning.expiry_s * S)
@@ -90,48 +99,51 @@ class VelocityController:
             now_ns, expires_ns, roll_us, pitch_us, self.model.throttle.width_us(climb), self.model.yaw_us(rate)
         )
 
-    def _lean_sticks(
-        self, now_ns: int, v_ned_m_s: tuple[float, float, float], vehicle: VehicleState, above_m: float, coast: bool
-    ) -> tuple[int, int]:
-        neutral = self.model.roll.trim_us, self.model.pitch.trim_us
-        if coast:
-            return neutral
+    def _push(
+        self, now_ns: int, dt_s: float, v_ned_m_s: tuple[float, float, float], vehicle: VehicleState, above_m: float
+    ) -> Vector2 | None:
+        """Return the acceleration (north, east) to lean for, drag not counted; None for neutral sticks."""
         stopping = math.hypot(v_ned_m_s[0], v_ned_m_s[1]) < STANDSTILL_M_S
         predicted = self._predicted_m_s(now_ns, vehicle, above_m)
         if stopping and (self.tuning.stop_lean_rad == 0.0 or math.hypot(*predicted) < 3 * STANDSTILL_M_S):
-            self.reset()
-            return neutral
+            self._north.reset()
+            self._east.reset()
+            return None
         wanted = (0.0, 0.0) if stopping else (v_ned_m_s[0], v_ned_m_s[1])
-        acceleration = self._acceleration(now_ns, wanted, predicted, above_m)
-        brake_lean = self.tuning.stop_lean_rad if stopping else self.tuning.brake_lean_rad
-        north, east = _bounded(acceleration, predicted, self.tuning.max_lean_rad, brake_lean)
-        cos, sin = math.cos(vehicle.yaw_rad), math.sin(vehicle.yaw_rad)
-        return self.model.sticks_for_acceleration(cos * north + sin * east, cos * east - sin * north)
-
-    def _acceleration(
-        self, now_ns: int, wanted: tuple[float, float], predicted: tuple[float, float], above_m: float
-    ) -> tuple[float, float]:
-        """Drag at the wanted speed fed forward, PI on what is missing."""
-        dt_s = min(0.1, max(0.001, (now_ns - self._last_ns) / S)) if self._last_ns else 0.02
-        self._last_ns = now_ns
         most = G_M_S2 * math.tan(min(self.tuning.max_lean_rad, self.model.lean_max_rad))
         north, east = (
             loop.step(want - have, dt_s, -most, most, self.model.drag_m_s2(want, above_m))
             for loop, want, have in zip((self._north, self._east), wanted, predicted, strict=True)
         )
-        return north, east
+        brake_lean = self.tuning.stop_lean_rad if stopping else self.tuning.brake_lean_rad
+        return _bounded((north, east), predicted, self.tuning.max_lean_rad, brake_lean)
 
-    def _predicted_m_s(self, now_ns: int, vehicle: VehicleState, above_m: float) -> tuple[float, float]:
-        """Velocity (north, east) at the time when a lean commanded now takes hold, from the present lean and drag."""
+    def _predicted_m_s(self, now_ns: int, vehicle: VehicleState, above_m: float) -> Vector2:
+        """Velocity at the time when a lean commanded now takes hold, by Loiter's own law on what was commanded.
+
+        The attitude would not do: it shows the airframe's drag, not Loiter's.
+        """
         age_s = max(0.0, min(0.2, (now_ns - vehicle.position_t_ns) / S))
         ahead_s = age_s + self.tuning.lean_lag_s
-        v_north, v_east, _ = vehicle.v_ned_m_s
-        forward = -G_M_S2 * math.tan(vehicle.pitch_rad)
-        right = G_M_S2 * math.tan(vehicle.roll_rad)
-        cos, sin = math.cos(vehicle.yaw_rad), math.sin(vehicle.yaw_rad)
-        a_north = cos * forward - sin * right - self.model.drag_m_s2(v_north, above_m)
-        a_east = sin * forward + cos * right - self.model.drag_m_s2(v_east, above_m)
-        return v_north + ahead_s * a_north, v_east + ahead_s * a_east
+        north, east = (
+            v + ahead_s * (felt - self.model.drag_m_s2(v, above_m))
+            for v, felt in zip(vehicle.v_ned_m_s[:2], self._felt, strict=True)
+        )
+        return north, east
+
+    def _feel(self, push: Vector2, dt_s: float) -> None:
+        """Follow what was commanded through the lag of the lean."""
+        share = 1.0 - math.exp(-dt_s / self.tuning.lean_lag_s)
+        self._felt = (
+            self._felt[0] + share * (push[0] - self._felt[0]),
+            self._felt[1] + share * (push[1] - self._felt[1]),
+        )
+
+    def _lean_sticks(self, push: Vector2 | None, yaw_rad: float) -> tuple[int, int]:
+        if push is None:
+            return self.model.roll.trim_us, self.model.pitch.trim_us
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        return self.model.sticks_for_acceleration(cos * push[0] + sin * push[1], cos * push[1] - sin * push[0])
 
     def _climb_m_s(self, error_m: float) -> float:
         tuning = self.tuning
@@ -146,9 +158,7 @@ class VelocityController:
         return max(-tuning.yaw_rate_max_rad_s, min(tuning.yaw_rate_max_rad_s, tuning.yaw_gain_1_s * error_rad))
 
 
-def _bounded(
-    acceleration: tuple[float, float], velocity: tuple[float, float], max_lean_rad: float, brake_lean_rad: float
-) -> tuple[float, float]:
+def _bounded(acceleration: Vector2, velocity: Vector2, max_lean_rad: float, brake_lean_rad: float) -> Vector2:
     """Shorten an acceleration to the largest lean, and its part against the motion to the brake's lean."""
     north, east = acceleration
     speed = math.hypot(*velocity)
