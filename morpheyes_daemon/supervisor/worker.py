@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
 from morpheyes_daemon.clock import Clock
-from morpheyes_daemon.errors import MorphEyesError
+from morpheyes_daemon.errors import DeviceError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -18,11 +18,11 @@ JobIn = TypeVar("JobIn", contravariant=True)
 ResultOut = TypeVar("ResultOut", covariant=True)
 
 
-class WorkerLost(MorphEyesError):
+class WorkerLost(DeviceError):
     """The worker hung, died, or has not come up again yet; the job is lost, a later one may be done."""
 
 
-class WorkerFailed(MorphEyesError):
+class WorkerFailed(DeviceError):
     """The computation itself raised; the worker lives on. `remote_traceback` is the worker's own, as text."""
 
     def __init__(self, message: str, remote_traceback: str = "") -> None:
