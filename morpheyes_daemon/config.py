@@ -160,6 +160,7 @@ class SafetyConfig(Section):
     dead_daemon_s: float = Field(
         1.0, ge=0, le=5, description="how long the autopilot flies on when we die (RC_OVERRIDE_TIME, FS_THR)"
     )
+    battery_low_pct: float = Field(20.0, ge=0, le=90, description="brake and do not engage below this charge")
     depth_sigmas: float = Field(3.0, ge=1, le=6, description="depth is trusted where this many sigmas fit")
     max_relative_depth_error: float = Field(0.2, gt=0.01, le=1.0)
     max_speed_m_s: float = Field(4.0, gt=0.1, le=10, description="a last bound; the governor is the real one")

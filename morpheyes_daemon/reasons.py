@@ -35,6 +35,7 @@ class Reason(StrEnum):
     MODE_NOT_LOITER = "mode_not_loiter", 22, "the autopilot is not in Loiter"
     DISARMED = "disarmed", 23, "the vehicle is not armed"
     ALREADY_FLYING = "already_flying", 24, "the daemon started in flight: it only observes"
+    LANDED = "landed", 25, "the vehicle is on the ground"
 
     # inputs that went stale
     FRAME_STALE = "frame_stale", 40, "no fresh camera frame"
@@ -46,6 +47,7 @@ class Reason(StrEnum):
     SWITCH_STALE = "switch_stale", 46, "the pilot's switch has not been heard of lately"
     GCS_LOST = "gcs_lost", 47, "the ground station's heartbeat is gone"
     BASELINE_STALE = "baseline_stale", 48, "the servo does not answer"
+    PARAMETERS_UNKNOWN = "parameters_unknown", 49, "the autopilot's parameters have not been read yet"
 
     # what the mission and governor brake for
     OBSTACLE_CLOSE = "obstacle_close", 60, "an obstacle is nearer than the safe braking distance"

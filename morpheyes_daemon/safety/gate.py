@@ -12,7 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
-from morpheyes_daemon.clock import S
+from morpheyes_daemon.clock import MS, S
+from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages import Sticks
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.states import EFFECTS, Action, State
@@ -20,27 +21,42 @@ from morpheyes_daemon.safety.states import EFFECTS, Action, State
 RELEASE_REPEAT_S = 1.0
 """A lost release datagram leaves the last stick in force, so it is repeated for this long."""
 
+RELEASE_REPEATS = 20
+"""And at least this often, should the loop have been held up meanwhile."""
+
+LONGEST_LEASE_NS = 10 * S
+"""A lease or an offer that claims to last longer carries a wrong stamp and is not believed."""
+
+LATE_NS = 100 * MS
+"""After a pause as long as this the sticks start from neutral again."""
+
+NARROWEST_US, WIDEST_US = 800, 2200
+"""What RCn_MIN and RCn_MAX may be; 0, 65534 and 65535 mean other things than a width."""
+
+Widths = tuple[int, int, int, int]
+"""Roll, pitch, throttle, yaw in microseconds."""
+
 
 class Lease(StrEnum):
-    """Inputs without which no stick is deflected; `reason` of each stands in `LEASE_REASONS`."""
+    """Inputs without which no stick is deflected, the gravest first; the reason of each is in `LEASE_REASONS`."""
 
-    FRAME = "frame"
-    DEPTH = "depth"
-    MISSION = "mission"
-    VEHICLE = "vehicle"
     LINK = "link"
     SWITCH = "switch"
     SUPERVISOR = "supervisor"
+    VEHICLE = "vehicle"
+    FRAME = "frame"
+    DEPTH = "depth"
+    MISSION = "mission"
 
 
 LEASE_REASONS: dict[Lease, Reason] = {
-    Lease.FRAME: Reason.FRAME_STALE,
-    Lease.DEPTH: Reason.DEPTH_STALE,
-    Lease.MISSION: Reason.MISSION_STALE,
-    Lease.VEHICLE: Reason.VEHICLE_STALE,
     Lease.LINK: Reason.LINK_LOST,
     Lease.SWITCH: Reason.SWITCH_STALE,
     Lease.SUPERVISOR: Reason.SUPERVISOR_STALE,
+    Lease.VEHICLE: Reason.VEHICLE_STALE,
+    Lease.FRAME: Reason.FRAME_STALE,
+    Lease.DEPTH: Reason.DEPTH_STALE,
+    Lease.MISSION: Reason.MISSION_STALE,
 }
 
 
@@ -49,13 +65,23 @@ class StickLimits:
     """Bounds of the four sticks in microseconds, from the autopilot's own RCn parameters.
 
     `neutral` is (roll trim, pitch trim, throttle mid-range, yaw trim). Away from neutral the sticks move at most
-    `slew_us_s`; towards neutral they may jump.
+    `slew_us_s`; towards neutral they may jump. Raises DeviceError for bounds that no radio has.
     """
 
-    minimum: tuple[int, int, int, int]
-    maximum: tuple[int, int, int, int]
-    neutral: tuple[int, int, int, int]
+    minimum: Widths
+    maximum: Widths
+    neutral: Widths
     slew_us_s: float = 4000.0
+
+    def __post_init__(self) -> None:
+        for low, middle, high in zip(self.minimum, self.neutral, self.maximum, strict=True):
+            if not NARROWEST_US <= low <= middle <= high <= WIDEST_US:
+                raise DeviceError(
+                    f"A stick ranges from {low} over {middle} to {high} us, which no radio does:"
+                    " calibrate the radio (RCn_MIN, RCn_TRIM, RCn_MAX)."
+                )
+        if not 0.0 < self.slew_us_s < math.inf:
+            raise DeviceError(f"The sticks' rate limit is {self.slew_us_s} us/s: it must be positive and finite.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +98,7 @@ class GateOutput:
     yaw_us: int = 0
 
     @property
-    def widths_us(self) -> tuple[int, int, int, int]:
+    def widths_us(self) -> Widths:
         """Roll, pitch, throttle, yaw."""
         return self.roll_us, self.pitch_us, self.throttle_us, self.yaw_us
 
@@ -85,9 +111,11 @@ class Gate:
         self._limits: StickLimits | None = None
         self._expiry: dict[Lease, int] = dict.fromkeys(Lease, 0)
         self._offer: Sticks | None = None
-        self._last: tuple[int, int, int, int] | None = None
-        self._last_ns = 0
-        self._released_since_ns: int | None = None
+        self._sent: Widths | None = None
+        self._state: State | None = None
+        self._stepped_ns = self._pause_ns = 0
+        self._release_ns: int | None = None
+        self._releases = 0
         self.rejected = 0
 
     @property
@@ -95,8 +123,13 @@ class Gate:
         """True once the autopilot's stick ranges are known; before that only a release can be sent."""
         return self._limits is not None
 
+    @property
+    def silent(self) -> bool:
+        """True while we hold no stick and have no release left to repeat."""
+        return self._sent is None and self._release_ns is None
+
     def set_limits(self, limits: StickLimits) -> None:
-        """Take the autopilot's stick ranges."""
+        """Take the autopilot's stick ranges; they count from the next stick period on."""
         self._limits = limits
 
     def renew(self, lease: Lease, expires_ns: int) -> None:
@@ -107,12 +140,16 @@ class Gate:
         """End a lease now."""
         self._expiry[lease] = 0
 
+    def is_fresh(self, lease: Lease, now_ns: int) -> bool:
+        """Tell whether one lease has not run out; one that lasts too long to be true is not fresh."""
+        return now_ns < self._expiry[lease] <= now_ns + LONGEST_LEASE_NS
+
     def stale(self, now_ns: int) -> Lease | None:
-        """Return the first lease that has run out, None when all are fresh."""
-        return next((lease for lease in Lease if now_ns >= self._expiry[lease]), None)
+        """Return the gravest lease that has run out, None when all are fresh."""
+        return next((lease for lease in Lease if not self.is_fresh(lease, now_ns)), None)
 
     def offer(self, sticks: Sticks) -> None:
-        """Put stick positions before the gate; they count until they expire."""
+        """Put stick positions before the gate; they count until they expire or a step lets no stick through."""
         if all(math.isfinite(w) for w in (sticks.roll_us, sticks.pitch_us, sticks.throttle_us, sticks.yaw_us)):
             self._offer = sticks
         else:
@@ -121,58 +158,83 @@ class Gate:
 
     def step(self, state: State, reason: Reason, now_ns: int) -> GateOutput:
         """Send what the state and the leases allow at this stick period and return it."""
+        self._begin(state, now_ns)
         effect = EFFECTS[state]
-        if effect is Action.RELEASE and self._released_since_ns is None:
-            self._released_since_ns = now_ns
-        if effect in (Action.RELEASE, Action.SILENT) or self._limits is None:
+        if self._limits is None or effect in (Action.RELEASE, Action.SILENT):
             return self._let_go(state, reason, now_ns)
-        if effect is Action.NEUTRAL:
-            return self._send(state, Action.NEUTRAL, reason, self._limits.neutral, now_ns)
-        lease = self.stale(now_ns)
-        if lease is not None:
-            return self._send(state, Action.NEUTRAL, LEASE_REASONS[lease], self._limits.neutral, now_ns)
-        offer = self._offer
-        if offer is None or now_ns >= offer.expires_ns:
-            return self._send(state, Action.NEUTRAL, Reason.MISSION_STALE, self._limits.neutral, now_ns)
-        wanted = (offer.roll_us, offer.pitch_us, offer.throttle_us, offer.yaw_us)
-        return self._send(state, Action.STICKS, None, self._bounded(wanted, now_ns), now_ns)
+        verdict = self._judge(reason, now_ns) if effect is Action.STICKS else reason
+        if isinstance(verdict, Sticks):
+            return self._send(state, Action.STICKS, None, self._bounded(self._limits, verdict), now_ns)
+        self._offer = None
+        return self._send(state, Action.NEUTRAL, verdict, self._limits.neutral, now_ns)
 
     def release(self, state: State, reason: Reason, now_ns: int) -> GateOutput:
         """Let go now, whatever the state; called on the spot when the pilot takes over and on the way out."""
-        self._released_since_ns = now_ns
+        self._start_release(now_ns)
         return self._let_go(state, reason, now_ns)
 
+    def _begin(self, state: State, now_ns: int) -> None:
+        """Forget what a change of state, a pause or a wrong stamp has made worthless."""
+        self._pause_ns = now_ns - self._stepped_ns
+        if state is not self._state or not 0 <= self._pause_ns <= LATE_NS:
+            self._offer = None
+        for lease in Lease:
+            if self._expiry[lease] > now_ns + LONGEST_LEASE_NS:
+                self.revoke(lease)
+        self._state, self._stepped_ns = state, now_ns
+
+    def _judge(self, reason: Reason, now_ns: int) -> Sticks | Reason:
+        """Return the sticks that may pass, or why none may; without any offer that is the state's own reason."""
+        lease = self.stale(now_ns)
+        if lease is not None:
+            return LEASE_REASONS[lease]
+        if self._offer is None:
+            return reason
+        believed = now_ns < self._offer.expires_ns <= now_ns + LONGEST_LEASE_NS
+        return self._offer if believed else Reason.COMMAND_INVALID
+
     def _let_go(self, state: State, reason: Reason, now_ns: int) -> GateOutput:
-        """Repeat a release that is still young, else say nothing."""
-        self._last = None
+        """Release what was held, repeat a release that is still young, else say nothing."""
+        if self._sent is not None:
+            self._start_release(now_ns)
+        self._sent = None
         self._offer = None
-        since_ns = self._released_since_ns
-        if since_ns is None or now_ns - since_ns > RELEASE_REPEAT_S * S:
+        if self._release_ns is None:
             return GateOutput(now_ns, state, Action.SILENT, reason)
-        out = GateOutput(now_ns, state, Action.RELEASE, reason)
-        self._output(out)
-        return out
+        self._releases += 1
+        if self._releases >= RELEASE_REPEATS and abs(now_ns - self._release_ns) >= RELEASE_REPEAT_S * S:
+            self._release_ns = None
+        return self._out(GateOutput(now_ns, state, Action.RELEASE, reason))
+
+    def _start_release(self, now_ns: int) -> None:
+        self._release_ns = now_ns
+        self._releases = 0
 
     def _send(
-        self, state: State, action: Action, reason: Reason | None, widths: tuple[int, int, int, int], now_ns: int
+        self, state: State, action: Action, reason: Reason | None, widths: Widths, now_ns: int
     ) -> GateOutput:
-        self._released_since_ns = None
-        self._last, self._last_ns = widths, now_ns
-        out = GateOutput(now_ns, state, action, reason, *widths)
+        self._release_ns = None
+        self._sent = widths
+        return self._out(GateOutput(now_ns, state, action, reason, *widths))
+
+    def _out(self, out: GateOutput) -> GateOutput:
         self._output(out)
         return out
 
-    def _bounded(self, wanted: tuple[int, int, int, int], now_ns: int) -> tuple[int, int, int, int]:
-        assert self._limits is not None
-        limits = self._limits
-        last = self._last or limits.neutral
-        dt_s = min(0.1, (now_ns - self._last_ns) / S) if self._last else 0.02
-        step = limits.slew_us_s * dt_s
-        bounded = []
-        for i in range(4):
-            neutral = limits.neutral[i]
-            want = max(limits.minimum[i], min(limits.maximum[i], round(wanted[i]))) - neutral
-            had = last[i] - neutral
-            reach = (abs(had) if want * had > 0 else 0.0) + step
-            bounded.append(neutral + round(math.copysign(min(abs(want), reach), want)))
-        return bounded[0], bounded[1], bounded[2], bounded[3]
+    def _bounded(self, limits: StickLimits, offer: Sticks) -> Widths:
+        wanted = (offer.roll_us, offer.pitch_us, offer.throttle_us, offer.yaw_us)
+        had = self._sent or limits.neutral
+        step_us = limits.slew_us_s * self._pause_ns / S
+        roll, pitch, throttle, yaw = (
+            _moved(limits.neutral[i], had[i], max(limits.minimum[i], min(limits.maximum[i], wanted[i])), step_us)
+            for i in range(4)
+        )
+        return roll, pitch, throttle, yaw
+
+
+def _moved(neutral: int, had: int, wanted: float, step_us: float) -> int:
+    """Return where a stick goes: away from neutral by `step_us` at most, towards it as far as wanted."""
+    away = round(wanted) - neutral
+    same_side = (had - neutral) * away > 0
+    reach = step_us + (abs(had - neutral) if same_side else 0)
+    return neutral + (away if abs(away) <= reach else int(math.copysign(reach, away)))

@@ -13,7 +13,7 @@ from morpheyes_daemon.reasons import Reason
 
 
 class State(StrEnum):
-    """Where the daemon is; `effect` of each stands in `EFFECTS`."""
+    """Where the daemon is; `EFFECTS` says what each lets out and `MEANING` what it is."""
 
     BOOT = "boot"
     PREFLIGHT = "preflight"
@@ -36,7 +36,7 @@ class Action(StrEnum):
 
 
 class Trigger(StrEnum):
-    """What can happen to the daemon."""
+    """What can happen to the daemon; `CAUSE` says when each is fired."""
 
     BOOTED = "booted"
     READY = "ready"
@@ -67,59 +67,76 @@ EFFECTS: dict[State, Action] = {
     State.RELEASED: Action.RELEASE,
     State.FAULT: Action.SILENT,
 }
-"""The most that each state lets out. The gate repeats a release for a while, then falls silent."""
+"""The most that each state lets out. Who held no stick releases none; a release is repeated, then silence."""
+
+HOLDING = tuple(state for state, effect in EFFECTS.items() if effect in (Action.STICKS, Action.NEUTRAL))
+"""The states in which the sticks are ours."""
 
 MEANING: dict[State, str] = {
     State.BOOT: "starting; nothing is sent",
     State.PREFLIGHT: "something needed is missing; nothing is sent",
-    State.STANDBY: "ready; waits for the pilot's switch, armed and in Loiter",
+    State.STANDBY: "ready; waits for the pilot's switch, armed, flying and in Loiter",
     State.ENGAGED: "the mission flies",
-    State.BRAKING: "neutral sticks; resumes only if the missing input returns before the vehicle has stopped",
+    State.BRAKING: "neutral sticks; resumes only if an input of our own returns in time and nothing else happened",
     State.HOLD: "neutral sticks at a standstill; waits for the pilot",
-    State.PILOT: "the pilot took over in flight; released until the switch has been seen off",
-    State.RELEASED: "released on purpose",
+    State.PILOT: "the pilot (or a failsafe) took over in flight; released until the switch has been seen off",
+    State.RELEASED: "let go; waits until the switch has been seen off",
     State.FAULT: "a fault outside flight; nothing is sent until it is mended",
 }
 
+CAUSE: dict[Trigger, str] = {
+    Trigger.BOOTED: "every task has been started",
+    Trigger.READY: "nothing needed is missing",
+    Trigger.NOT_READY: "something needed is missing",
+    Trigger.ENGAGE: "the switch went from off to on, both steadily, with the vehicle armed, flying, in Loiter",
+    Trigger.SWITCH_OFF: "the switch is heard off",
+    Trigger.MODE_LEFT: "a heartbeat says another mode than Loiter",
+    Trigger.DISARMED: "a heartbeat says disarmed",
+    Trigger.FOUND_FLYING: "armed and in the air before the daemon has ever heard the vehicle disarmed",
+    Trigger.STALE: "a lease has run out",
+    Trigger.FRESH: "every lease is fresh again, soon enough, and the reason allows it",
+    Trigger.FAULT: "a part failed, the autopilot reports trouble, or a clock or loop was late",
+    Trigger.CLEARED: "the last part that had failed works again",
+    Trigger.MISSION_OVER: "the mission is done, or refuses",
+    Trigger.STOPPED: "at rest, or the time for braking is over",
+    Trigger.LET_GO: "neutral for long enough on the way out, or the autopilot is no longer heard",
+    Trigger.SHUTDOWN: "the daemon was asked to stop",
+}
+
 _T, _S = Trigger, State
-_HOLDING = (_S.ENGAGED, _S.BRAKING, _S.HOLD)
 
 TRANSITIONS: dict[tuple[State, Trigger], State] = {
     (_S.BOOT, _T.BOOTED): _S.PREFLIGHT,
-    (_S.BOOT, _T.FOUND_FLYING): _S.PILOT,
-    (_S.BOOT, _T.FAULT): _S.FAULT,
-    (_S.BOOT, _T.SHUTDOWN): _S.RELEASED,
     (_S.PREFLIGHT, _T.READY): _S.STANDBY,
-    (_S.PREFLIGHT, _T.FOUND_FLYING): _S.PILOT,
-    (_S.PREFLIGHT, _T.FAULT): _S.FAULT,
-    (_S.PREFLIGHT, _T.SHUTDOWN): _S.RELEASED,
+    (_S.PREFLIGHT, _T.NOT_READY): _S.PREFLIGHT,
     (_S.STANDBY, _T.NOT_READY): _S.PREFLIGHT,
     (_S.STANDBY, _T.ENGAGE): _S.ENGAGED,
-    (_S.STANDBY, _T.FAULT): _S.FAULT,
-    (_S.STANDBY, _T.SHUTDOWN): _S.RELEASED,
     (_S.ENGAGED, _T.STALE): _S.BRAKING,
+    (_S.ENGAGED, _T.FAULT): _S.BRAKING,
     (_S.ENGAGED, _T.MISSION_OVER): _S.BRAKING,
+    (_S.BRAKING, _T.STALE): _S.BRAKING,
+    (_S.BRAKING, _T.FAULT): _S.BRAKING,
+    (_S.BRAKING, _T.MISSION_OVER): _S.BRAKING,
     (_S.BRAKING, _T.FRESH): _S.ENGAGED,
     (_S.BRAKING, _T.STOPPED): _S.HOLD,
-    (_S.BRAKING, _T.LET_GO): _S.RELEASED,
-    (_S.HOLD, _T.LET_GO): _S.RELEASED,
+    **{(state, _T.SWITCH_OFF): _S.RELEASED for state in HOLDING},
+    **{(state, _T.DISARMED): _S.RELEASED for state in HOLDING},
+    **{(state, _T.MODE_LEFT): _S.PILOT for state in HOLDING},
+    **{(state, _T.LET_GO): _S.RELEASED for state in HOLDING},
+    **{(state, _T.SHUTDOWN): _S.BRAKING for state in HOLDING},
     (_S.PILOT, _T.SWITCH_OFF): _S.PREFLIGHT,
-    (_S.PILOT, _T.SHUTDOWN): _S.RELEASED,
     (_S.RELEASED, _T.SWITCH_OFF): _S.PREFLIGHT,
+    **{(state, _T.FOUND_FLYING): _S.PILOT for state in (_S.BOOT, _S.PREFLIGHT, _S.STANDBY)},
+    **{(state, _T.FAULT): _S.FAULT for state in (_S.BOOT, _S.PREFLIGHT, _S.STANDBY, _S.FAULT)},
     (_S.FAULT, _T.CLEARED): _S.PREFLIGHT,
-    (_S.FAULT, _T.SHUTDOWN): _S.RELEASED,
-    **{(state, _T.SWITCH_OFF): _S.RELEASED for state in _HOLDING},
-    **{(state, _T.DISARMED): _S.RELEASED for state in _HOLDING},
-    **{(state, _T.MODE_LEFT): _S.PILOT for state in _HOLDING},
-    **{(state, _T.FAULT): _S.BRAKING for state in (_S.ENGAGED, _S.BRAKING)},
-    **{(state, _T.SHUTDOWN): _S.BRAKING for state in _HOLDING},
+    **{(state, _T.SHUTDOWN): _S.RELEASED for state in (_S.BOOT, _S.PREFLIGHT, _S.STANDBY, _S.PILOT, _S.FAULT)},
 }
 """(state, trigger) -> next state; a pair that is not here changes nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """One step of the machine."""
+    """One step of the machine; `before` and `after` are the same when only the reason changed."""
 
     t_ns: int
     before: State
@@ -149,7 +166,11 @@ class Machine:
 
 
 def mermaid() -> str:
-    """Return the table as a Mermaid state diagram."""
-    lines = ["stateDiagram-v2", "    [*] --> boot"]
-    lines += [f"    {before} --> {after}: {trigger}" for (before, trigger), after in TRANSITIONS.items()]
+    """Return the table as a Mermaid state diagram; ways that only change the reason are left out."""
+    arrows: dict[tuple[State, State], list[Trigger]] = {}
+    for (before, trigger), after in TRANSITIONS.items():
+        if after is not before:
+            arrows.setdefault((before, after), []).append(trigger)
+    lines = ["stateDiagram-v2", f"    [*] --> {State.BOOT}"]
+    lines += [f"    {before} --> {after}: {', '.join(triggers)}" for (before, after), triggers in arrows.items()]
     return "\n".join(lines)

@@ -101,11 +101,11 @@ class Supervisor:
         if pulse.on_first is None:
             self._events.publish(Event(now_ns, task.name, task.fault, text))
         if task.essential:
-            self._guardian.fault(task.fault, now_ns)
+            self._guardian.fault(task.fault, now_ns, task.name)
         pulse.on_first = lambda: self._recovered(task)
 
     def _recovered(self, task: Task) -> None:
         now_ns = self._clock.now_ns()
         self._events.publish(Event(now_ns, task.name, Reason.RECOVERED, f"{task.name}: works again"))
         if task.essential:
-            self._guardian.clear(task.fault, now_ns)
+            self._guardian.clear(task.fault, now_ns, task.name)
