@@ -1,0 +1,41 @@
+"""What the autopilot reports about itself that forbids flying on: one row per concern, worst first.
+
+On the ground a concern keeps the daemon from being ready; in flight it brakes and waits for the pilot. What the
+autopilot itself does about it (RTL, LAND) comes as a mode change, which releases.
+"""
+
+from __future__ import annotations
+
+from morpheyes_daemon.clock import S
+from morpheyes_daemon.messages import VehicleState
+from morpheyes_daemon.reasons import Reason
+
+CRITICAL = 5
+"""MAV_STATE_CRITICAL: ArduCopter reports it while any failsafe is triggered; what is above is worse."""
+
+POSITION_FLAGS = 0x08 | 0x10
+"""EKF_STATUS_REPORT: relative (optical flow) or absolute (GPS) horizontal position."""
+
+CONSTANT_POSITION = 0x80
+"""EKF_STATUS_REPORT: the EKF pretends not to move, for want of any aiding."""
+
+
+def ekf_healthy(vehicle: VehicleState) -> bool:
+    """Tell whether the autopilot has a position to hold; not before it has said so."""
+    flags = vehicle.ekf_flags
+    return bool(vehicle.ekf_t_ns and flags & POSITION_FLAGS and not flags & CONSTANT_POSITION)
+
+
+def concern(vehicle: VehicleState, now_ns: int, battery_low: float, gcs_timeout_s: float | None) -> Reason | None:
+    """Return the worst concern, None when there is none.
+
+    `battery_low` is a fraction of the charge; a battery that nobody measures (NaN) is no concern.
+    `gcs_timeout_s` None does not watch the ground station.
+    """
+    rows = (
+        (Reason.FAILSAFE, vehicle.system_status >= CRITICAL),
+        (Reason.EKF_UNHEALTHY, not ekf_healthy(vehicle)),
+        (Reason.BATTERY_LOW, 0.0 <= vehicle.battery_fraction < battery_low),
+        (Reason.GCS_LOST, gcs_timeout_s is not None and now_ns - vehicle.gcs_t_ns >= gcs_timeout_s * S),
+    )
+    return next((reason for reason, holds in rows if holds), None)
