@@ -24,23 +24,10 @@ from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.recorder.pictures.scene import Disc, Scene
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import Action, State
+from tests.hand_clock import HandClock
 
-START_NS = 1000 * S
 STICK_HZ = 50
 CAMERA_HZ = 5
-
-
-class HandClock:
-    """A clock that the test moves."""
-
-    def __init__(self, t_ns: int = START_NS) -> None:
-        self.t_ns = t_ns
-
-    def now_ns(self) -> int:
-        return self.t_ns
-
-    async def sleep_until_ns(self, t_ns: int) -> None:
-        self.t_ns = max(self.t_ns, t_ns)
 
 
 def forest_scene(seed: int = 0) -> Scene:

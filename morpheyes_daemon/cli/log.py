@@ -41,6 +41,7 @@ def _content(flight: Flight) -> dict[str, Any]:
         "seconds": round((max(times) - min(times)) / 1e9, 3) if times else 0.0,
         "finished": flight.damage.finished,
         "bad_chunks": flight.damage.bad_chunks,
+        "bad_messages": flight.damage.bad_messages,
         "topics": dict(sorted(counts.items())),
         "config": json.loads(config) if config else None,
     }

@@ -16,9 +16,9 @@ import zstandard
 from mcap.exceptions import EndOfFile, InvalidMagic, RecordLengthLimitExceeded, UnsupportedCompressionError
 from mcap.records import Channel, Chunk, Footer, Message, Metadata, Schema
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
-from mcap.writer import CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.errors import InputError, RecordingError
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.recorder.channels import EVENTS
 from morpheyes_daemon.recorder.encoding import find_type, from_plain
@@ -26,15 +26,16 @@ from morpheyes_daemon.recorder.flight_log import CHUNK_BYTES, HEADER, LIBRARY
 from morpheyes_daemon.recorder.series import FlightSeries
 
 LARGEST_RECORD = 64 * 1024 * 1024
-_CUT = (EndOfFile, struct.error, RecordLengthLimitExceeded, UnicodeDecodeError, ValueError)
+_CUT = (EndOfFile, InvalidMagic, struct.error, RecordLengthLimitExceeded, ValueError)
 _BAD_CHUNK = (*_CUT, CRCValidationError, UnsupportedCompressionError, zstandard.ZstdError, RuntimeError)
 
 
 @dataclass(slots=True)
 class Damage:
-    """What was wrong with a log: chunks that could not be unpacked, and an end that is missing."""
+    """What was wrong with a log: chunks and messages that could not be unpacked, and whether the end is there."""
 
     bad_chunks: int = 0
+    bad_messages: int = 0
     finished: bool = False
 
 
@@ -74,12 +75,12 @@ class Flight:
 
 
 def read_flight(path: Path) -> Flight:
-    """Read a log; raises InputError when it is none, RecordingError when a message cannot be understood."""
+    """Read a log; raises InputError when it is none. Messages that cannot be understood are counted and left out."""
     flight = Flight(path)
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     with open_log(path) as stream:
-        for record in records(stream, path, flight.damage):
+        for record in records(stream, flight.damage):
             if isinstance(record, Metadata) and record.name == HEADER:
                 flight.header = dict(record.metadata)
             elif isinstance(record, Schema):
@@ -89,28 +90,33 @@ def read_flight(path: Path) -> Flight:
             elif isinstance(record, Message) and record.channel_id in channels:
                 channel = channels[record.channel_id]
                 schema = schemas.get(channel.schema_id)
-                flight.records.append(_record(channel.topic, schema.name if schema else "", record))
+                try:
+                    flight.records.append(_record(channel.topic, schema.name if schema else "", record))
+                except (RecordingError, ValueError, KeyError):
+                    flight.damage.bad_messages += 1
     return flight
 
 
 def open_log(path: Path) -> IO[bytes]:
-    """Open a file for reading; raises InputError with a sentence."""
+    """Open a log for reading; raises InputError with a sentence."""
     try:
-        return path.open("rb")
+        stream = path.open("rb")
+        start = stream.read(len(MCAP0_MAGIC))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    if start != MCAP0_MAGIC:
+        stream.close()
+        raise InputError(f"{path}: is not a flight log (an MCAP file).")
+    stream.seek(0)
+    return stream
 
 
-def records(stream: IO[bytes], path: Path, damage: Damage) -> Iterator[Any]:
+def records(stream: IO[bytes], damage: Damage) -> Iterator[Any]:
     """Yield the MCAP records of a log as far as they go, noting in `damage` what was not readable."""
     reader = StreamReader(stream, emit_chunks=True, record_size_limit=LARGEST_RECORD).records
     while True:
         try:
             record = next(reader)
-        except InvalidMagic:
-            if stream.tell() <= len(b"\x89MCAP0\r\n"):
-                raise InputError(f"{path}: is not a flight log (MCAP).") from None
-            return
         except (StopIteration, *_CUT):
             return
         if isinstance(record, Chunk):
@@ -157,7 +163,7 @@ def recover(path: Path, out: Path) -> Recovered:
         writer: Any = Writer(target, CHUNK_BYTES // 2, CompressionType.ZSTD)
         writer.start(library=LIBRARY)
         numbers = _Numbers(writer)
-        for record in records(stream, path, damage):
+        for record in records(stream, damage):
             if isinstance(record, Message):
                 topic = numbers.copy_message(record)
                 messages += topic is not None

@@ -94,18 +94,18 @@ class FlightSeries:
         return np.array(times, dtype=np.float64), np.array([m.p_ned_m for m in rows], dtype=np.float64).reshape(-1, 3)
 
     def at(self, times_s: Column, topic: str, name: str) -> Column:
-        """Return a field interpolated at `times_s`; NaN everywhere when the topic is empty."""
-        known = self.times_s(topic)
+        """Return a field interpolated at `times_s`, an angle without jumps; NaN when the topic is empty."""
+        known, values = self.times_s(topic), self.column(topic, name)
         if known.size == 0:
             return np.full(times_s.shape, np.nan)
-        return np.interp(times_s, known, self.column(topic, name))
+        return np.interp(times_s, known, np.unwrap(values) if name.endswith("_rad") else values)
 
     def spans(self, topic: str, name: str) -> list[tuple[float, float, str]]:
         """Return (from_s, to_s, word) for each stretch over which a field keeps its value."""
         times, words = self.times_s(topic), self.words(topic, name)
         starts = [i for i in range(len(words)) if i == 0 or words[i] != words[i - 1]]
-        ends = [*(float(times[i]) for i in starts[1:]), self.duration_s]
-        return [(float(times[i]), end, words[i]) for i, end in zip(starts, ends, strict=True)]
+        ends = [float(times[i]) for i in starts[1:]] + [self.duration_s]
+        return [(float(times[i]), end, words[i]) for i, end in zip(starts, ends, strict=False)]
 
     def braking(self) -> list[tuple[float, str]]:
         """Return (second, reason) of each time the vehicle was made to stop, by the gate or by the mission."""

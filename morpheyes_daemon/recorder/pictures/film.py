@@ -5,6 +5,7 @@ Fed by taps while flying in lockstep, or by a log afterwards; each perception wi
 
 from __future__ import annotations
 
+import base64
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,10 +18,12 @@ from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config import Footprint
 from morpheyes_daemon.messages import BaselineEstimate, DepthSummary, Governed, Image, Perception, VehicleState
+from morpheyes_daemon.recorder.channels import DEPTH_IMAGE, LEFT_IMAGE
 from morpheyes_daemon.recorder.pictures.colours import MAX_BASELINE_M, MIN_BASELINE_M, baseline_bgr, colour_depth
 from morpheyes_daemon.recorder.pictures.scene import Scene
 from morpheyes_daemon.recorder.pictures.topview import Pose, TopView
 from morpheyes_daemon.recorder.pictures.video import VideoWriter
+from morpheyes_daemon.recorder.reader import Flight
 
 PANEL_W, PANEL_H, LINE_H = 480, 360, 40
 DARK = (38, 34, 32)
@@ -54,6 +57,21 @@ class FlightFilm:
         """Film from now on; costs some milliseconds per frame, in whoever publishes."""
         for name in ("vehicle", "baseline", "governed", "gate", "perception"):
             getattr(topics, name).tap(lambda value, name=name: self.add(name, value))
+
+    @classmethod
+    def of_log(cls, path: Path, flight: Flight, scene: Scene, footprint: Footprint) -> int:
+        """Make the film of a recorded flight from the pictures in its log; returns their number."""
+        film, left, count = cls(path, scene, footprint), None, 0
+        for record in flight.records:
+            if f"/{record.topic}" == LEFT_IMAGE:
+                left = _decoded(record.value)
+            elif f"/{record.topic}" == DEPTH_IMAGE and left is not None:
+                film.show(record.log_ns, left, _decoded(record.value))
+                count += 1
+            else:
+                film.add(record.topic, record.value)
+        film.close()
+        return count
 
     def add(self, topic: str, value: Any) -> None:
         """Take one message; a perception that carries images becomes a picture."""
@@ -95,6 +113,12 @@ def _pose(newest: Newest) -> Pose:
         seen_m=min(seen_m, 50.0),
         h_fov_rad=newest.summary.h_fov_rad if newest.summary else 0.0,
     )
+
+
+def _decoded(compressed: dict[str, Any]) -> Image:
+    """The picture of a recorded foxglove.CompressedImage."""
+    data = np.frombuffer(base64.b64decode(compressed["data"]), dtype=np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)
 
 
 def _fit(image: Image, room: Image) -> None:

@@ -32,8 +32,8 @@ class Track:
     def of(cls, series: FlightSeries) -> Track:
         """Return the track of a flight; baseline NaN where unknown."""
         times_s, path = series.path_ned_m()
-        yaw = np.interp(times_s, series.times_s("vehicle"), np.unwrap(series.column("vehicle", "yaw_rad")))
-        return cls(times_s, path[:, :2], yaw, series.at(times_s, "baseline", "baseline_m"))
+        yaw, baseline = series.at(times_s, "vehicle", "yaw_rad"), series.at(times_s, "baseline", "baseline_m")
+        return cls(times_s, path[:, :2], yaw, baseline)
 
     def __len__(self) -> int:
         return len(self.times_s)

@@ -46,7 +46,8 @@ def draw_strips(out: Path, series: FlightSeries, *, title: str = "") -> None:
         _quiet(axes)
     for axes in rows[:-1]:
         _shade_braking(axes, series)
-        axes.legend(loc="upper left", bbox_to_anchor=(1.005, 1.0), fontsize=8.5, frameon=False, borderaxespad=0.0)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.005, 1.0), fontsize=8.5, frameon=False, borderaxespad=0)
     rows[0].set_xlim(0.0, max(series.duration_s, 1e-3))
     rows[0].set_title(title, fontsize=10, loc="left")
     rows[-1].set_xlabel("time [s]", fontsize=9)
