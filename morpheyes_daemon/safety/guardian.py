@@ -42,6 +42,9 @@ RESUMED = frozenset(
 )
 """Braking for these, and only these, may end in flying on; while the pilot was not heard he may have taken over."""
 
+NOT_RESUMED = (Reason.GOAL_REACHED, Reason.MISSION_REFUSED, Reason.SHUTDOWN)
+"""Stops that somebody asked for, as against braking for want of something."""
+
 
 @dataclass(frozen=True, slots=True)
 class GuardianLimits:
