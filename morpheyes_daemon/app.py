@@ -75,7 +75,7 @@ class Daemon:
         self.hub = AutopilotHub(config.autopilot, parts.clock, topics, events, parts.opener)
         self._send = self.hub.claim_stick_output()
         self.gate = Gate(self._output)
-        self.guardian = Guardian(self.gate, guardian_limits(config), self._on_transition)
+        self.guardian = Guardian(self.gate, GuardianLimits.of(config), self._on_transition)
         self.control: FlightControl | None = None
         self._governor = Governor(governor_limits(config))
         self._model = BaselineModel(config.servo.motion) if not isinstance(config.servo, NoServoConfig) else None
@@ -102,7 +102,7 @@ class Daemon:
             self.guardian.boot_done(self._clock.now_ns())
             await asyncio.wait({running, stopping}, return_when=asyncio.FIRST_COMPLETED)
             if not running.done():
-                await self._leave()
+                await self._leave(running)
         finally:
             self.guardian.release_now(Reason.SHUTDOWN, self._clock.now_ns())
             for task in (running, stopping):
@@ -113,11 +113,11 @@ class Daemon:
         if isinstance(failure, Exception):
             raise failure
 
-    async def _leave(self) -> None:
+    async def _leave(self, running: asyncio.Task[None]) -> None:
         """Neutral for a while if we hold the sticks, then the release, repeated by the gate."""
         self.guardian.shutdown(self._clock.now_ns())
         held = self.topics.gate.get()
-        while not self.guardian.let_go:
+        while not (self.guardian.let_go or running.done()):
             await self._clock.sleep_until_ns(self._clock.now_ns() + S // 50)
         if held is not None and held.action is not Action.SILENT:
             await self._clock.sleep_until_ns(self._clock.now_ns() + S // 5)
@@ -234,18 +234,6 @@ class Daemon:
         self.hub.send_named_float("me_age", report.ages_s["frame"])
         with contextlib.suppress(OSError):
             self._parts.tell(report)
-
-
-def guardian_limits(config: VehicleConfig) -> GuardianLimits:
-    """Return the ages the guardian goes by."""
-    return GuardianLimits(
-        vehicle_timeout_s=config.safety.vehicle_timeout_s,
-        switch_timeout_s=config.safety.switch_timeout_s,
-        link_timeout_s=config.autopilot.link_timeout_s,
-        neutral_before_release_s=config.safety.neutral_before_release_s,
-        engage_channel=config.autopilot.engage_channel,
-        engage_above_us=config.autopilot.engage_above_us,
-    )
 
 
 def governor_limits(config: VehicleConfig) -> GovernorLimits:
