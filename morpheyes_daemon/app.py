@@ -202,12 +202,13 @@ class Daemon:
         """The autopilot's own numbers, new: how it flies and where its sticks end."""
         try:
             model = LoiterModel.from_parameters(values)
+            limits = StickLimits(model.minimum, model.maximum, model.neutral)
         except DeviceError as error:
             self.events.publish(Event(self._clock.now_ns(), "autopilot", Reason.DOCTOR_SAYS_NO, str(error)))
             return
         lean_rad = min(self.config.safety.max_lean_deg * 0.0174533, model.lean_max_rad)
         self.control = FlightControl(model, self._governor, VelocityTuning(max_lean_rad=lean_rad))
-        self.gate.set_limits(StickLimits(model.minimum, model.maximum, model.neutral))
+        self.gate.set_limits(limits)
 
     def _output(self, out: GateOutput) -> None:
         """The gate's output, in the order of the radio's channels."""
