@@ -153,7 +153,7 @@ class AutopilotTwin:
 
     def _on_timesync(self, message: Any, port: AutopilotPort) -> None:
         if message.tc1 == 0:
-            since_boot_ns = self.autopilot.t_ns - self.autopilot.boot_ns
+            since_boot_ns = self._clock.now_ns() - self.autopilot.boot_ns
             port.send(mavlink.MAVLink_timesync_message(max(1, since_boot_ns), message.ts1))
 
     def _on_param_list(self, _: Any, port: AutopilotPort) -> None:
