@@ -14,7 +14,7 @@ from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import S, run_virtual, running_clock
 from morpheyes_daemon.config import NoServoConfig, ServoMotion
 from morpheyes_daemon.devices.link import Link, MemoryLink, OnBytes, OnLost
-from morpheyes_daemon.devices.servo import build_servo, open_servo
+from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.devices.servo.serial import SerialServo
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from morpheyes_daemon.messages import Event
@@ -256,6 +256,22 @@ def test_a_long_silence_opens_the_link_anew() -> None:
     flies(scene())
 
 
+def test_a_closed_servo_can_be_opened_again() -> None:
+    async def scene() -> None:
+        async with bench() as b:
+            await b.servo.open()
+            await b.servo.move(0.25)
+            await b.servo.close()
+            with pytest.raises(DeviceLostError):
+                await b.servo.move(0.2)
+            await b.servo.open()
+            await b.servo.move(0.2)
+            assert b.cable.opened == 2
+            assert b.events == []
+
+    flies(scene())
+
+
 def test_stuck_servos_acknowledge_and_stay_and_wrong_ones_go_elsewhere() -> None:
     async def scene() -> None:
         async with bench() as b:
@@ -287,6 +303,5 @@ def test_the_fixed_rig_accepts_its_own_baseline_only() -> None:
         with pytest.raises(DeviceError, match=r"fixed at 57\.7 mm"):
             await servo.move(0.1)
         await servo.close()
-        assert type(await open_servo(config, no_opener, running_clock(), EventLog())) is type(servo)
 
     flies(scene())

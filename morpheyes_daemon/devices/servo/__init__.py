@@ -32,10 +32,3 @@ def build_servo(config: ServoConfig, opener: LinkOpener, clock: Clock, events: E
     from morpheyes_daemon.devices.servo.serial import SerialServo
 
     return SerialServo(config.url, config.motion, opener, clock, events)
-
-
-async def open_servo(config: ServoConfig, opener: LinkOpener, clock: Clock, events: EventLog) -> Servo:
-    """Return the configured backend, open; raises DeviceNotFoundError and leaves nothing behind."""
-    servo = build_servo(config, opener, clock, events)
-    await servo.open()
-    return servo

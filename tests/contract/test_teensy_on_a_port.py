@@ -1,0 +1,91 @@
+"""The Teensy twin on a real pseudo-terminal, opened with the serial library in real time."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+
+import pytest
+import serial_asyncio
+
+from morpheyes_daemon.bus import EventLog
+from morpheyes_daemon.clock import MonotonicClock
+from morpheyes_daemon.config import ServoMotion
+from morpheyes_daemon.devices.link import Link, OnBytes, OnLost
+from morpheyes_daemon.devices.servo.serial import SerialServo
+from morpheyes_daemon.messages import Event
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.simulation.pseudo_terminal import PseudoTerminal
+from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals here")
+
+
+class Port(asyncio.Protocol):
+    """The serial library's transport as a link."""
+
+    def __init__(self, on_bytes: OnBytes, on_lost: OnLost) -> None:
+        self._on_bytes, self._on_lost = on_bytes, on_lost
+        self._transport: asyncio.WriteTransport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = transport  # type: ignore[assignment]
+
+    def data_received(self, data: bytes) -> None:
+        self._on_bytes(data)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        if self._transport is not None:
+            self._on_lost(str(error or "closed"))
+
+    def write(self, data: bytes) -> None:
+        if self._transport is not None:
+            self._transport.write(data)
+
+    def close(self) -> None:
+        transport, self._transport = self._transport, None
+        if transport is not None:
+            transport.abort()
+
+
+async def open_port(url: str, on_bytes: OnBytes, on_lost: OnLost) -> Link:
+    loop = asyncio.get_running_loop()
+    _, port = await serial_asyncio.create_serial_connection(loop, lambda: Port(on_bytes, on_lost), url, 115200)
+    return port
+
+
+async def test_the_twin_answers_on_its_port_and_a_pulled_cable_is_noticed() -> None:
+    events: list[Event] = []
+    noticed = asyncio.Event()
+
+    def note(event: Event) -> None:
+        events.append(event)
+        noticed.set()
+
+    log = EventLog()
+    log.subscribe(note)
+    clock = MonotonicClock()
+    twin = TeensyTwin(ServoTruth(), clock, seed=1)
+    terminal = PseudoTerminal(twin.receive)
+    twin.connect(terminal.write)
+    servo = SerialServo(terminal.path, ServoMotion(), open_port, clock, log)
+    await servo.open()
+    await servo.move(0.25)
+    twin.receive(b"noise without an end")
+    await servo.move(0.3)
+    assert twin.baseline_at(clock.now_ns()) > 0.19
+    assert servo.dropped_frames == 0
+    terminal.close()
+    terminal.close()
+    async with asyncio.timeout(20):
+        await noticed.wait()
+    assert events[0].reason is Reason.SERVO_LOST
+    await servo.close()
+
+
+async def test_a_port_that_nobody_reads_drops_what_is_too_much() -> None:
+    terminal = PseudoTerminal(lambda data: None)
+    for _ in range(100):
+        terminal.write(bytes(1000))
+    assert terminal.lost_bytes > 0
+    terminal.close()
