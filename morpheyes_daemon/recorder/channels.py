@@ -16,8 +16,8 @@ import numpy as np
 
 from morpheyes_daemon.messages import Event, FloatMap, Image, Perception, VehicleState
 from morpheyes_daemon.recorder.encoding import to_plain, type_name
-from morpheyes_daemon.recorder.pictures.colours import colour_depth
 from morpheyes_daemon.recorder.schemas import dataclass_schema, schema_text, timestamp
+from morpheyes_daemon.stereo.colours import colour_depth
 from morpheyes_daemon.transforms import R_from_rpy, q_from_R
 
 EVENTS = "/events"

@@ -11,7 +11,6 @@ from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config import Footprint
 from morpheyes_daemon.messages import BaselineEstimate, VehicleState
-from morpheyes_daemon.recorder.pictures.colours import UNKNOWN_BGR, baseline_bgr, colour_depth
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import DPI, LEFT_IN, RIGHT_IN, WIDTH_IN, draw_map
 from morpheyes_daemon.recorder.pictures.outline import Track, clearances, closest_passes
@@ -21,6 +20,7 @@ from morpheyes_daemon.recorder.pictures.topview import TREE, Pose, TopView
 from morpheyes_daemon.recorder.reader import read_flight
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.series import FlightSeries
+from morpheyes_daemon.stereo.colours import UNKNOWN_BGR, baseline_bgr, colour_depth
 from tests.hand_clock import HandClock
 from tests.synthetic_flight import SyntheticFlight, forest_scene
 

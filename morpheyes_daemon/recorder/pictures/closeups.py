@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from morpheyes_daemon.config import Footprint
-from morpheyes_daemon.recorder.pictures.colours import baseline_bgr
 from morpheyes_daemon.recorder.pictures.outline import Track, boxes, placed
 from morpheyes_daemon.recorder.pictures.scene import Scene
+from morpheyes_daemon.stereo.colours import baseline_bgr
 
 LEFT_IN, BOTTOM_IN, WIDTH_IN, HEIGHT_IN, APART_IN = 4.9, 0.14, 2.2, 1.66, 0.15
 NORTH_M = 3.2

@@ -19,11 +19,11 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.config import Footprint
 from morpheyes_daemon.messages import BaselineEstimate, DepthSummary, Governed, Image, Perception, VehicleState
 from morpheyes_daemon.recorder.channels import DEPTH_IMAGE, LEFT_IMAGE
-from morpheyes_daemon.recorder.pictures.colours import MAX_BASELINE_M, MIN_BASELINE_M, baseline_bgr, colour_depth
 from morpheyes_daemon.recorder.pictures.scene import Scene
 from morpheyes_daemon.recorder.pictures.topview import Pose, TopView
 from morpheyes_daemon.recorder.pictures.video import VideoWriter
 from morpheyes_daemon.recorder.reader import Flight
+from morpheyes_daemon.stereo.colours import MAX_BASELINE_M, MIN_BASELINE_M, baseline_bgr, colour_depth
 
 PANEL_W, PANEL_H, LINE_H = 480, 360, 40
 DARK = (38, 34, 32)

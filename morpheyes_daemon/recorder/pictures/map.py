@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.config import Footprint
 from morpheyes_daemon.recorder.pictures.closeups import draw_closeups
-from morpheyes_daemon.recorder.pictures.colours import MAX_BASELINE_M, MIN_BASELINE_M
 from morpheyes_daemon.recorder.pictures.outline import Track, clearances, closest_passes
 from morpheyes_daemon.recorder.pictures.scene import Scene
 from morpheyes_daemon.recorder.series import FlightSeries
+from morpheyes_daemon.stereo.colours import MAX_BASELINE_M, MIN_BASELINE_M
 
 Points = NDArray[np.float64]
 Limits = tuple[float, float, float, float]

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.config import Footprint
 from morpheyes_daemon.messages import Image
-from morpheyes_daemon.recorder.pictures.colours import baseline_bgr
 from morpheyes_daemon.recorder.pictures.outline import boxes, placed
 from morpheyes_daemon.recorder.pictures.scene import Scene
+from morpheyes_daemon.stereo.colours import baseline_bgr
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]

@@ -1,4 +1,4 @@
-"""The colours all pictures share: baselines in jet as in the paper, depth from warm (near) to cold (far)."""
+"""The colours that every picture shares: baselines in jet as in the paper, depth from warm (near) to cold (far)."""
 
 from __future__ import annotations
 
