@@ -74,6 +74,9 @@ class BootClock:
             self._synced_ns = (sent_ns + now_ns) // 2 - autopilot_ns
 
     def _offset_ns(self) -> int | None:
-        if self._round_trip_ns is not None:
-            return self._synced_ns
-        return self._arrival.smallest()
+        """The exchange's offset where it makes a plausible delay of the fastest arrival, else that arrival's."""
+        arrival_ns = self._arrival.smallest()
+        if arrival_ns is None or self._round_trip_ns is None:
+            return arrival_ns
+        delay_ns = arrival_ns - self._synced_ns
+        return self._synced_ns if -MS <= delay_ns <= self._round_trip_ns else arrival_ns

@@ -97,6 +97,11 @@ class AutopilotHub:
         return self._up
 
     @property
+    def bad_bytes(self) -> int:
+        """Bytes since the port was opened that belonged to no valid frame."""
+        return self._decoder.bad_bytes
+
+    @property
     def rejected_frames(self) -> int:
         """Frames dropped for a missing or wrong signature."""
         return self._decoder.rejected
