@@ -46,7 +46,7 @@ class GroundCrew:
     def on_bytes(self, data: bytes) -> None:
         """Take bytes from the autopilot."""
         for message in self._mav.parse_buffer(data) or []:
-            if message.get_srcSystem() != self._target[0]:
+            if (message.get_srcSystem(), message.get_srcComponent()) != self._target:
                 continue
             self.latest[message.get_type()] = message
             if message.get_type() == "STATUSTEXT":
