@@ -47,8 +47,11 @@ class Scapegoat:
     def nice(self, _: Any) -> int:
         return os.nice(0)
 
-    def fail(self, text: str) -> None:
+    def refuse(self, text: str) -> None:
         raise CalibrationError(text)
+
+    def fail(self, text: str) -> None:
+        raise ZeroDivisionError(text)
 
     def unpicklable(self, _: Any) -> Any:
         return lambda: None

@@ -23,7 +23,7 @@ class WorkerLost(DeviceError):
 
 
 class WorkerFailed(DeviceError):
-    """The computation itself raised; the worker lives on. `remote_traceback` is the worker's own, as text."""
+    """The computation raised something unforeseen; the worker lives on. `remote_traceback` is its own, as text."""
 
     def __init__(self, message: str, remote_traceback: str = "") -> None:
         super().__init__(message)
@@ -34,7 +34,7 @@ class VisionWorker(Protocol[JobIn, ResultOut]):
     """Computes one job at a time."""
 
     async def start(self) -> None:
-        """Get ready; returns when the first job can be taken. Raises WorkerLost or WorkerFailed."""
+        """Get ready; returns when the first job can be taken. Raises WorkerLost or what building raised."""
 
     async def compute(self, job: JobIn) -> ResultOut:
         """Return the result of `job`. Raises WorkerLost or WorkerFailed."""

@@ -21,6 +21,7 @@ from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, Generic, Protocol
 
+from morpheyes_daemon.errors import MorphEyesError
 from morpheyes_daemon.supervisor.mailbox import Mailbox
 from morpheyes_daemon.supervisor.worker import Job, JobIn, Result, ResultOut, WorkerFailed, WorkerLost
 
@@ -45,7 +46,8 @@ class Perceiver(Protocol[JobIn, ResultOut]):
 class ProcessWorker(Generic[Job, Result]):
     """A `VisionWorker` that builds `factory()` in another process and calls its `perceive` there.
 
-    `factory` and what it needs must be picklable, jobs and results too.
+    `factory` and what it needs must be picklable, jobs and results too. A MorphEyesError raised there is raised here
+    as it is, anything else as WorkerFailed.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class ProcessWorker(Generic[Job, Result]):
         return self._child.process.pid if self._child else None
 
     async def start(self) -> None:
-        """Start the process and wait until it has built its object; WorkerFailed when that raised."""
+        """Start the process and wait until it has built its object; raises what that raised."""
         await self._ready()
 
     async def compute(self, job: Job) -> Result:
@@ -154,7 +156,7 @@ class ProcessWorker(Generic[Job, Result]):
         while True:
             try:
                 return await self._start_one()
-            except (WorkerLost, WorkerFailed):
+            except MorphEyesError:
                 continue
 
 
@@ -180,7 +182,7 @@ class _Child:
         self._started = False
 
     async def start(self, factory: Callable[[], Any], niceness: int) -> None:
-        """Start the process and wait until it is ready; EOFError when it dies, WorkerFailed when it says why."""
+        """Start the process and wait until it is ready; EOFError when it dies, or what it raised."""
         ours, theirs = socket.socketpair()
         with theirs:
             socket.send_fds(ours, [_JOB], [self._jobs.fd, self._results.fd])
@@ -208,7 +210,7 @@ class _Child:
         while self._awaited:  # of a caller that was cancelled
             try:
                 await self._answer()
-            except WorkerFailed:
+            except MorphEyesError:
                 continue
         self._jobs.put(job)
         self._writer.write(_JOB)
@@ -220,10 +222,12 @@ class _Child:
         (verdict,) = _REPLY.unpack(await self._reader.readexactly(_REPLY.size))
         self._awaited -= 1
         content = self._results.take()
-        if verdict == _Verdict.FAILED:
-            summary, trace = content
-            raise WorkerFailed(f"The vision worker failed: {summary}.", trace)
-        return content
+        if verdict == _Verdict.DONE:
+            return content
+        if isinstance(content, MorphEyesError):
+            raise content
+        summary, trace = content
+        raise WorkerFailed(f"The vision worker failed: {summary}.", trace)
 
     def kill(self) -> None:
         """Send SIGKILL, to which even hung native code listens."""
@@ -290,7 +294,8 @@ def _reply(link: socket.socket, results: Mailbox, work: Callable[[], Any]) -> No
         results.put(work())
         verdict = _Verdict.DONE
     except Exception as error:  # noqa: BLE001 -- the worker's task boundary
-        results.put((f"{type(error).__name__}: {error}", traceback.format_exc()))
+        told = isinstance(error, MorphEyesError)
+        results.put(error if told else (f"{type(error).__name__}: {error}", traceback.format_exc()))
         verdict = _Verdict.FAILED
     link.sendall(_REPLY.pack(verdict))
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.clock import MS, run_virtual, running_clock
+from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.messages import BaselineEstimate, StereoFrame
 from morpheyes_daemon.supervisor.mailbox import Mailbox
 from morpheyes_daemon.supervisor.worker import InlineWorker, WorkerFailed, WorkerLost
@@ -80,12 +81,14 @@ async def test_big_frames_pass_both_ways_unchanged() -> None:
 async def test_an_exception_inside_is_told_and_the_worker_lives_on() -> None:
     async with worker() as w:
         pid = w.pid
-        with pytest.raises(WorkerFailed, match=r"CalibrationError: baseline 0\.4") as caught:
-            await w.compute(Order("fail", "baseline 0.4 m is outside"))
+        with pytest.raises(CalibrationError, match=r"^baseline 0\.4 m is outside$"):
+            await w.compute(Order("refuse", "baseline 0.4 m is outside"))
+        with pytest.raises(WorkerFailed, match="ZeroDivisionError: by zero") as caught:
+            await w.compute(Order("fail", "by zero"))
         assert "in fail" in caught.value.remote_traceback
         with pytest.raises(WorkerFailed, match="pickle"):
             await w.compute(Order("unpicklable"))
-        assert await w.compute(Order("count")) == 3
+        assert await w.compute(Order("count")) == 4
         assert (w.pid, w.restarts) == (pid, 0)
 
 
@@ -157,7 +160,7 @@ async def test_ctrl_c_does_not_reach_the_worker() -> None:
 
 async def test_a_factory_that_raises_says_why() -> None:
     made: ProcessWorker[Order, Any] = ProcessWorker(never_built, job_timeout_s=1)
-    with pytest.raises(WorkerFailed, match=r"calibration\.yaml: there is no such file"):
+    with pytest.raises(CalibrationError, match=r"calibration\.yaml: there is no such file"):
         await made.start()
     await made.close()
 

@@ -74,6 +74,27 @@ def test_three_sigma_hold_the_truth_when_commands_are_doubtful(
         assert abs(twin.baseline_at(t_ns) - estimate.baseline_m) <= 3 * estimate.sigma_m
 
 
+@settings(max_examples=100, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    commands=st.lists(st.tuples(waits_ms, targets_m, st.integers(0, 300)), min_size=1, max_size=8),
+)
+def test_an_acknowledgement_may_come_late_when_the_sending_was_noted(
+    seed: int, commands: list[tuple[int, float, int]]
+) -> None:
+    clock = HandClock()
+    twin, model = twin_on(clock, seed), BaselineModel(MOTION)
+    for wait_ms, target_m, answer_ms in commands:
+        clock.t_ns += wait_ms * MS
+        model.doubt(target_m, clock.t_ns)
+        send(twin, target_m)
+        clock.t_ns += answer_ms * MS
+        model.command(target_m, clock.t_ns)
+    for t_ns in range(clock.t_ns - HISTORY_NS, clock.t_ns + 6 * S, 97 * MS):
+        estimate = model.at(t_ns)
+        assert abs(twin.baseline_at(t_ns) - estimate.baseline_m) <= 3 * estimate.sigma_m
+
+
 def test_before_the_first_command_only_the_range_is_known() -> None:
     estimate = BaselineModel(MOTION).at(5 * S)
     assert estimate.baseline_m == pytest.approx(0.2, abs=0.5e-3)  # half the play

@@ -48,7 +48,7 @@ class SimulatorCamera:
         )
 
     async def read(self) -> RawPair:
-        """Return the newest pair; DeviceTimeoutError when no frame comes, DeviceLostError when the simulator is gone."""
+        """Return the newest pair; DeviceTimeoutError when none comes, DeviceLostError when the simulator is gone."""
         if self._receiver is None:
             raise DeviceLostError("The simulated camera is not open.")
         return await self._newest.take(
