@@ -1,8 +1,9 @@
-"""The Teensy and its two linear servos: answers the real bytes and knows where the eyes truly are.
+"""The Teensy and its two linear servos: answers the real bytes and knows where the servos truly are.
 
 Each servo follows its target with a limited speed and a proportional end, after a latency, and carries its eye with
 play: the eye lies between screw − play and screw. Targets are reached with a seeded repeatability error. The twin
-speaks over any link (`connect`); it opens none itself. Only the simulator reads `baseline_at`.
+speaks over any link (`connect`); it opens none itself. Only the simulator reads `baseline_at`, which is on the
+servos' own scale: what length it is on the bar is the rig's (`RigTwin.actual_m`).
 """
 
 from __future__ import annotations
@@ -41,10 +42,7 @@ HISTORY_NS = 60 * S
 
 @dataclass(frozen=True, slots=True)
 class ServoTruth:
-    """What the servos of a twin really do; lengths of the whole baseline, speed and backlash of one camera.
-
-    `nonlinearity_m` is the amplitude of a full sine over the range, zero at both ends and in the middle.
-    """
+    """What the servos of a twin really do; lengths of the whole baseline, speed and backlash of one camera."""
 
     min_m: float = 0.100
     max_m: float = 0.300
@@ -54,7 +52,6 @@ class ServoTruth:
     latency_s: float = 0.020
     settle_s: float = 0.150
     repeatability_sigma_m: float = 0.1e-3
-    nonlinearity_m: float = 0.0
     start_m: float = 0.200
 
     @classmethod
@@ -71,11 +68,6 @@ class ServoTruth:
             repeatability_sigma_m=motion.repeatability_sigma_mm / 1e3,
             start_m=(low_m + high_m) / 2,
         )
-
-    def true_baseline_m(self, commanded_m: float) -> float:
-        """Return the length that a baseline approached by shrinking really has, repeatability aside."""
-        phase = (commanded_m - self.min_m) / (self.max_m - self.min_m)
-        return commanded_m + self.nonlinearity_m * math.sin(2 * math.pi * phase)
 
 
 class ServoFault(Enum):
@@ -125,8 +117,8 @@ class TeensyTwin:
             self._answer(message)
 
     def baseline_at(self, t_ns: int) -> float:
-        """Return the true distance between the eyes in metres, now or up to a minute ago."""
-        return self._truth.true_baseline_m(sum(eye.at(t_ns) for eye in self._eyes))
+        """Return where the servos hold the eyes apart, in metres on their own scale, now or up to a minute ago."""
+        return sum(eye.at(t_ns) for eye in self._eyes)
 
     def inject(self, fault: ServoFault) -> None:
         """Let a fault begin now."""
