@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, overload
 
 import cv2
 import numpy as np
@@ -21,7 +21,9 @@ from morpheyes_daemon.stereo.matching import Match, MatchSettings, disparity_ran
 from morpheyes_daemon.stereo.rectify import Rectification, Rectifier
 from morpheyes_daemon.stereo.rig import RigModel
 
-Depth = TypeVar("Depth", float, NDArray[np.float64], FloatMap)
+
+TALL_PX = 400
+"""Image height from which every second row is enough: 640x480 so matched is still better than 320x240 in full."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +48,7 @@ class DepthEstimator:
         self.rectifier = Rectifier(rig, size)
         self.calibration_hash = rig.hash
         self.config = config or StereoConfig()
-        self.settings = settings or MatchSettings()
+        self.settings = settings or default_settings(self.rig.size[1])
 
     @property
     def rig(self) -> RigModel:
@@ -115,6 +117,11 @@ class DepthEstimator:
         )
 
 
+def default_settings(height: int) -> MatchSettings:
+    """Return how to match in flight: from TALL_PX rows on they are taken two by two, for half the time."""
+    return MatchSettings(row_step=2 if height >= TALL_PX else 1)
+
+
 def depth_from_disparity(disparity_px: FloatMap, baseline_m: float, f_px: float, doffs_px: float = 0.0) -> FloatMap:
     """Return Z = b f / (d + doffs) (H, W) float32 metres, NaN where the disparity is unknown or Z is not finite.
 
@@ -130,22 +137,35 @@ def near_limit_m(baseline_m: float, f_px: float, ceiling_px: float, doffs_px: fl
     return baseline_m * f_px / (ceiling_px + doffs_px)
 
 
+@overload
 def depth_sigma(
-    depth_m: Depth,
+    depth_m: float, baseline_m: float, f_px: float, sigma_disparity_px: float, baseline_sigma_m: float = ...,
+    yaw_sigma_rad: float = ...,
+) -> float: ...  # fmt: skip
+
+
+@overload
+def depth_sigma(
+    depth_m: NDArray[Any], baseline_m: float, f_px: float, sigma_disparity_px: float, baseline_sigma_m: float = ...,
+    yaw_sigma_rad: float = ...,
+) -> NDArray[Any]: ...  # fmt: skip
+
+
+def depth_sigma(
+    depth_m: float | NDArray[Any],
     baseline_m: float,
     f_px: float,
     sigma_disparity_px: float,
     baseline_sigma_m: float = 0.0,
     yaw_sigma_rad: float = 0.0,
-) -> Depth:
+) -> float | NDArray[Any]:
     """Return one sigma of a depth, metres: eps_z = z^2 eps_d / (b f) (paper, section II) and what else moves it.
 
     A baseline wrong by a share moves the depth by that share; a yaw between the eyes moves the disparity by f per
     radian. The three are independent and added in squares.
     """
     error_px = math.hypot(sigma_disparity_px, f_px * yaw_sigma_rad)
-    share = baseline_sigma_m / baseline_m
-    relative = ((depth_m * (error_px / (baseline_m * f_px))) ** 2 + share**2) ** 0.5
+    relative = np.hypot(depth_m * (error_px / (baseline_m * f_px)), baseline_sigma_m / baseline_m)
     return depth_m * relative
 
 

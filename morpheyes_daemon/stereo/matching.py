@@ -28,6 +28,22 @@ SUBPIXELS = 16
 """StereoSGBM returns disparities in sixteenths of a pixel."""
 
 
+def _straightened() -> FloatMap:
+    """Return the true fraction (16,) for each fraction that StereoSGBM gives, relative to its whole pixel.
+
+    OpenCV fits a parabola to a cost that is a V, which draws x = delta / (2 (1 - delta)) from the true delta towards
+    whole pixels, and its integer division lifts negative fractions by one step. Both are undone.
+    """
+    step = np.arange(SUBPIXELS)
+    step = np.where(step <= SUBPIXELS // 2, step, step - SUBPIXELS)
+    x = (step - np.select([step < 0, step == 0], [1.0, 0.5], 0.0)) / SUBPIXELS
+    true = np.sign(x) * 2 * np.abs(x) / (1 + 2 * np.abs(x))
+    return np.asarray(true - step / SUBPIXELS, dtype=np.float32)
+
+
+_CORRECTION_PX = _straightened()
+
+
 @dataclass(frozen=True, slots=True)
 class MatchSettings:
     """How to match; the penalties are per pixel of the block's area, sizes are pixels of the image matched.
@@ -36,12 +52,12 @@ class MatchSettings:
     """
 
     block_px: int = 3
-    small_step_penalty: int = 8
-    large_step_penalty: int = 32
-    gradient_cap: int = 31
-    uniqueness_pct: int = 10
+    small_step_penalty: int = 4
+    large_step_penalty: int = 16
+    gradient_cap: int = 63
+    uniqueness_pct: int = 15
     left_right_px: int = 1
-    speckle_per_image: float = 1 / 3000
+    speckle_per_image: float = 1 / 1200
     row_step: int = 1
     coarse_width_px: int = 160
     coarse_range: float = 3.0
@@ -113,10 +129,10 @@ def semi_global(
     )
     before, after = max(0, low + count), max(0, -low)
     padded = [cv2.copyMakeBorder(eye, 0, 0, before, after, cv2.BORDER_REPLICATE) for eye in (left, right)]
-    fixed = matcher.compute(*padded)[:, before : before + left.shape[1]]
-    disparity = fixed.astype(np.float32) / np.float32(SUBPIXELS)
+    fixed = np.asarray(matcher.compute(*padded), dtype=np.int16)[:, before : before + left.shape[1]]
+    disparity = fixed.astype(np.float32) / np.float32(SUBPIXELS) + _CORRECTION_PX[fixed & (SUBPIXELS - 1)]
     column = np.arange(left.shape[1], dtype=np.float32)
-    disparity[(disparity < low) | (disparity > column + 0.5)] = np.nan
+    disparity[(fixed < low * SUBPIXELS) | (disparity > column + 0.5)] = np.nan
     return np.asarray(disparity)
 
 
@@ -159,32 +175,42 @@ def _forget_unseen(disparity: FloatMap, left_seen: Mask | None, right_seen: Mask
     if left_seen is not None:
         disparity[~left_seen] = np.nan
     if right_seen is not None:
-        rows, columns = np.nonzero(np.isfinite(disparity))
-        partner = np.clip(np.rint(columns - disparity[rows, columns]).astype(np.intp), 0, disparity.shape[1] - 1)
-        lost = ~right_seen[rows, partner]
-        disparity[rows[lost], columns[lost]] = np.nan
+        # what an eye sees of a rectified row is one piece
+        width = right_seen.shape[1]
+        first = right_seen.argmax(axis=1)
+        last = np.where(right_seen.any(axis=1), width - 1 - right_seen[:, ::-1].argmax(axis=1), -1)
+        partner = np.arange(width, dtype=np.float32) - disparity
+        disparity[(partner < first[:, None] - 0.5) | (partner > last[:, None] + 0.5)] = np.nan
 
 
 def _one_eyed(disparity: FloatMap, near: Mask, ceiling: float) -> Mask:
     """Return where something nearer hides an unknown pixel from the right eye, or the image's edge does.
 
     Seen from the right eye a nearer surface with disparity d_f covers d_f - d_b pixels of the background (d_b) left
-    of its own left edge; at the image's edge d_f pixels are missing.
+    of its own left edge; at the image's edge d_f pixels are missing. What lies left of something too near may well
+    belong to it, so nothing is said about that.
     """
-    width = disparity.shape[1]
-    unknown = np.isnan(disparity) & ~near
-    nearer = np.where(near, np.float32(ceiling), disparity)
-    column = np.arange(width, dtype=np.int32)
-    before = np.maximum.accumulate(np.where(unknown, np.int32(-1), column), axis=1)
-    after = np.minimum.accumulate(np.where(unknown, np.int32(width), column)[:, ::-1], axis=1)[:, ::-1]
-    rows, columns = np.nonzero(unknown)
-    left, right = before[rows, columns], after[rows, columns]
-    d_right = np.where(right < width, nearer[rows, np.minimum(right, width - 1)], -np.inf)
-    d_left = nearer[rows, np.maximum(left, 0)]
-    hidden = np.where(left < 0, columns <= d_right, right - columns <= d_right - d_left + 1.0)
-    mask = np.zeros(disparity.shape, dtype=np.bool_)
-    mask[rows, columns] = hidden
-    return mask
+    height, width = disparity.shape
+    row, first, end = _runs(np.isnan(disparity) & ~near)
+    left, right = np.maximum(first - 1, 0), np.minimum(end, width - 1)
+    d_left = np.where(near[row, left], np.float32(ceiling), disparity[row, left])
+    covers = (end < width) & ~near[row, right]
+    d_right = np.where(covers, disparity[row, right], np.float32(-width))
+    hidden_from = np.where(first == 0, 0, np.maximum(first, end - np.floor(d_right - d_left + 1.0)))
+    hidden_to = np.where(first == 0, np.minimum(end, np.floor(d_right) + 1.0), end)
+    some = hidden_from < hidden_to
+    change = np.zeros((height, width + 1), dtype=np.int8)
+    change[row[some], hidden_from[some].astype(np.intp)] = 1
+    change[row[some], hidden_to[some].astype(np.intp)] = -1
+    return np.asarray(np.cumsum(change, axis=1, dtype=np.int8)[:, :width].astype(np.bool_))
+
+
+def _runs(mask: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Return row, first column and end column (one past the last) of every unbroken run of True along a row."""
+    width = mask.shape[1] + 2
+    framed = np.pad(mask, ((0, 0), (1, 1))).ravel()
+    edges = np.flatnonzero(framed[1:] != framed[:-1]) + 1
+    return edges[::2] // width, edges[::2] % width - 1, edges[1::2] % width - 1
 
 
 def _require_pair(left: Image, right: Image, num_disparities: int) -> None:
