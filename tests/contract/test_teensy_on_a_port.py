@@ -1,4 +1,4 @@
-"""The Teensy twin on a real pseudo-terminal, opened with the serial library in real time."""
+"""The Teensy twin on a real pseudo-terminal, opened as the daemon opens its ports, in real time."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import asyncio
 import sys
 
 import pytest
-import serial_asyncio
 
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import MonotonicClock
 from morpheyes_daemon.config import ServoMotion
-from morpheyes_daemon.devices.link import Link, OnBytes, OnLost
+from morpheyes_daemon.devices.link import open_link
 from morpheyes_daemon.devices.servo.serial import SerialServo
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.reasons import Reason
@@ -19,39 +18,6 @@ from morpheyes_daemon.simulation.pseudo_terminal import PseudoTerminal
 from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals here")
-
-
-class Port(asyncio.Protocol):
-    """The serial library's transport as a link."""
-
-    def __init__(self, on_bytes: OnBytes, on_lost: OnLost) -> None:
-        self._on_bytes, self._on_lost = on_bytes, on_lost
-        self._transport: asyncio.WriteTransport | None = None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = transport  # type: ignore[assignment]
-
-    def data_received(self, data: bytes) -> None:
-        self._on_bytes(data)
-
-    def connection_lost(self, error: Exception | None) -> None:
-        if self._transport is not None:
-            self._on_lost(str(error or "closed"))
-
-    def write(self, data: bytes) -> None:
-        if self._transport is not None:
-            self._transport.write(data)
-
-    def close(self) -> None:
-        transport, self._transport = self._transport, None
-        if transport is not None:
-            transport.abort()
-
-
-async def open_port(url: str, on_bytes: OnBytes, on_lost: OnLost) -> Link:
-    loop = asyncio.get_running_loop()
-    _, port = await serial_asyncio.create_serial_connection(loop, lambda: Port(on_bytes, on_lost), url, 115200)
-    return port
 
 
 async def test_the_twin_answers_on_its_port_and_a_pulled_cable_is_noticed() -> None:
@@ -68,7 +34,7 @@ async def test_the_twin_answers_on_its_port_and_a_pulled_cable_is_noticed() -> N
     twin = TeensyTwin(ServoTruth(), clock, seed=1)
     terminal = PseudoTerminal(twin.receive)
     twin.connect(terminal.write)
-    servo = SerialServo(terminal.path, ServoMotion(), open_port, clock, log)
+    servo = SerialServo(f"serial:{terminal.path}:115200", ServoMotion(), open_link, clock, log)
     await servo.open()
     await servo.move(0.25)
     twin.receive(b"noise without an end")
