@@ -23,8 +23,8 @@ RESTED_DEADBAND, TIRED_DEADBAND = 0.03, 0.15
 """Relative change of baseline, and so of depth error, worth a motion with a full and with a spent duty budget."""
 OVERSHOOT_M = 0.001
 """Beyond the play (twice 0.25 mm), so that the last piece of a growing motion is a shrinking one."""
-LOST_SIGMA_M = 0.005
-"""A baseline less well known than this, at rest, is made known by commanding it."""
+LOST_M = 0.001
+"""Doubt beyond backlash and repeatability, at rest, that is worth commanding the place again."""
 WINDOW_NS = 300 * S
 """Duty of small actuators is rated over minutes, commonly 2 in 10 (motor heat); half of that to be careful."""
 
@@ -44,6 +44,7 @@ class BaselinePlanner:
         self._range_m = motion.min_baseline_mm / 1e3, motion.max_baseline_mm / 1e3
         self._rate_m_s = 2 * motion.speed_mm_s / 1e3 * (1 - SPEED_TOLERANCE)
         self._overshoot_m = OVERSHOOT_M if motion.backlash_mm > 0 else 0.0
+        self._lost_sigma_m = LOST_M + (motion.repeatability_sigma_mm + motion.backlash_mm) / 1e3
         self._budget_ns = round(WINDOW_NS * motion.max_duty_pct / 100)
         self._motions: deque[_Motion] = deque()
         self._target_m: float | None = None
@@ -77,7 +78,7 @@ class BaselinePlanner:
         return aim_m
 
     def _is_lost(self, estimate: BaselineEstimate) -> bool:
-        return self._at_rest(estimate) and estimate.sigma_m > LOST_SIGMA_M
+        return self._at_rest(estimate) and estimate.sigma_m > self._lost_sigma_m
 
     def _at_rest(self, estimate: BaselineEstimate) -> bool:
         """Return whether the last motion is over, by plan and by model (which knows of it only after a latency)."""

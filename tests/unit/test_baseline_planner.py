@@ -102,9 +102,10 @@ def test_no_number_moves_nothing() -> None:
     assert rig.commands == []
 
 
-def test_a_servo_that_lost_its_place_is_commanded_again() -> None:
+@pytest.mark.parametrize("perhaps_m", [0.1, 0.195])
+def test_a_servo_that_lost_its_place_is_commanded_again(perhaps_m: float) -> None:
     rig = Rig().settled_at(0.2)
-    rig.model.doubt(0.1, rig.t_ns)
+    rig.model.doubt(perhaps_m, rig.t_ns)
     rig.t_ns += 10 * S
     rig.want(0.2, 8.0)
     assert rig.commands[0][1] == pytest.approx(0.201)
