@@ -12,7 +12,7 @@ import errno
 import os
 import termios
 from collections.abc import Awaitable, Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import serial
 import serial_asyncio
@@ -120,8 +120,7 @@ class _StreamLink(asyncio.Protocol):
         self.dropped_bytes = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
+        self._transport = cast(asyncio.Transport, transport)
         if not self.made.done():
             self.made.set_result(None)
 
@@ -175,8 +174,7 @@ class _DatagramLink(asyncio.DatagramProtocol):
         self.dropped_bytes = 0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.DatagramTransport)
-        self._transport = transport
+        self._transport = cast(asyncio.DatagramTransport, transport)
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         if self._listens and self._peer is None:

@@ -8,7 +8,7 @@ believed. Two half windows make the filter forget, so that drift between the two
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from morpheyes_daemon.clock import MS, S
 
@@ -20,22 +20,26 @@ REBOOT_MS = 2000
 """Boot time that is this much behind what it must be is a reboot; reordering is milliseconds."""
 
 
-@dataclass(slots=True)
-class _Window:
+T = TypeVar("T", int, tuple[int, int])
+
+
+class _Smallest(Generic[T]):
     """The smallest value of the present and the last half window."""
 
-    started_ns: int = 0
-    present: int | None = None
-    last: int | None = None
+    def __init__(self) -> None:
+        self._started_ns = 0
+        self._present: T | None = None
+        self._last: T | None = None
 
-    def add(self, value: int, now_ns: int) -> None:
-        if now_ns - self.started_ns >= HALF_WINDOW_NS:
-            self.started_ns, self.last, self.present = now_ns, self.present, None
-        self.present = value if self.present is None else min(self.present, value)
+    def add(self, value: T, now_ns: int) -> None:
+        if now_ns - self._started_ns >= HALF_WINDOW_NS:
+            self._started_ns, self._last, self._present = now_ns, self._present, None
+        self._present = value if self._present is None else min(self._present, value)
 
-    def smallest(self) -> int | None:
-        known = [value for value in (self.present, self.last) if value is not None]
-        return min(known) if known else None
+    def get(self) -> T | None:
+        if self._present is None or self._last is None:
+            return self._last if self._present is None else self._present
+        return min(self._present, self._last)
 
 
 class BootClock:
@@ -46,15 +50,13 @@ class BootClock:
 
     def reset(self) -> None:
         """Forget everything: the autopilot rebooted."""
-        self._arrival = _Window()
-        self._round_trip_ns: int | None = None
-        self._round_trip_at_ns = 0
-        self._synced_ns = 0
+        self._arrival_ns = _Smallest[int]()
+        self._exchange_ns = _Smallest[tuple[int, int]]()
 
     def stamp_ns(self, boot_ms: int, now_ns: int) -> int:
         """Return when a message stamped `boot_ms` and received at `now_ns` was measured."""
         boot_ns = boot_ms * MS
-        self._arrival.add(now_ns - boot_ns, now_ns)
+        self._arrival_ns.add(now_ns - boot_ns, now_ns)
         offset_ns = self._offset_ns()
         assert offset_ns is not None
         return max(now_ns - MAX_AGE_NS, min(now_ns, boot_ns + offset_ns))
@@ -66,17 +68,12 @@ class BootClock:
 
     def add_round_trip(self, sent_ns: int, autopilot_ns: int, now_ns: int) -> None:
         """Take one TIMESYNC exchange: our request at `sent_ns`, answered at the autopilot's `autopilot_ns`."""
-        round_trip_ns = now_ns - sent_ns
-        stale = now_ns - self._round_trip_at_ns > 2 * HALF_WINDOW_NS
-        if self._round_trip_ns is None or stale or round_trip_ns <= self._round_trip_ns:
-            self._round_trip_ns = round_trip_ns
-            self._round_trip_at_ns = now_ns
-            self._synced_ns = (sent_ns + now_ns) // 2 - autopilot_ns
+        self._exchange_ns.add((now_ns - sent_ns, (sent_ns + now_ns) // 2 - autopilot_ns), now_ns)
 
     def _offset_ns(self) -> int | None:
-        """The exchange's offset where it makes a plausible delay of the fastest arrival, else that arrival's."""
-        arrival_ns = self._arrival.smallest()
-        if arrival_ns is None or self._round_trip_ns is None:
+        """The fastest exchange's offset where it fits the fastest arrival, else that arrival's."""
+        arrival_ns, exchange = self._arrival_ns.get(), self._exchange_ns.get()
+        if arrival_ns is None or exchange is None:
             return arrival_ns
-        delay_ns = arrival_ns - self._synced_ns
-        return self._synced_ns if -MS <= delay_ns <= self._round_trip_ns else arrival_ns
+        round_trip_ns, synced_ns = exchange
+        return synced_ns if -MS <= arrival_ns - synced_ns <= round_trip_ns + MS else arrival_ns
