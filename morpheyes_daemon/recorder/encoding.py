@@ -25,13 +25,15 @@ from pydantic import BaseModel
 
 from morpheyes_daemon.errors import RecordingError
 from morpheyes_daemon.messages import Perception, StereoFrame
+from morpheyes_daemon.strategies.base import Observation
 
 LARGEST_LIST = 64
 OMITTED: Mapping[type, frozenset[str]] = {
     StereoFrame: frozenset({"left", "right"}),
     Perception: frozenset({"left_rect", "depth_m"}),
+    Observation: frozenset({"percept", "summary"}),
 }
-"""Fields that are never encoded: full images."""
+"""Fields that are never encoded: full images, and what another channel holds already."""
 
 
 def to_plain(value: Any) -> Any:

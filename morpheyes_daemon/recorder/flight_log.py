@@ -14,6 +14,7 @@ from typing import IO, Any, cast
 from mcap.writer import CompressionType, Writer
 
 from morpheyes_daemon import __version__
+from morpheyes_daemon.config import MissionFile, VehicleConfig
 from morpheyes_daemon.recorder.channels import Entry
 from morpheyes_daemon.recorder.spool import Spool
 
@@ -32,22 +33,21 @@ def flight_path(folder: Path, mission: str, wall_s: float) -> Path:
 
 
 def flight_header(
-    *, mission: str, config: Any, parameters: Any, calibration_hash: str, wall_s: float, **more: str
+    mission: str, mission_file: MissionFile, config: VehicleConfig, calibration_hash: str, wall_s: float, **more: str
 ) -> dict[str, str]:
-    """Return the log's header: versions, config and mission as JSON, the calibration's hash and the wall time."""
+    """Return the log's header: version, config and mission as JSON, the calibration's hash and the wall time.
+
+    `more` may hold `scene=Scene(...).as_json()` where the surroundings are known, for the map.
+    """
     return {
         "version": __version__,
         "mission": mission,
-        "config": _as_json(config),
-        "parameters": _as_json(parameters),
+        "mission_file": mission_file.model_dump_json(),
+        "config": config.model_dump_json(),
         "calibration_hash": calibration_hash,
         "wall_time": datetime.fromtimestamp(wall_s, UTC).isoformat(),
         **more,
     }
-
-
-def _as_json(model: Any) -> str:
-    return str(model.model_dump_json()) if hasattr(model, "model_dump_json") else json.dumps(model)
 
 
 def _free_name(path: Path) -> Path:

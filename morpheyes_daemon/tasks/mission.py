@@ -60,7 +60,9 @@ async def mission(
     percepts = topics.perception.reader()
     while True:
         seen = await percepts.next()
-        command = strategy.decide(observe(seen, track, vehicle, guardian, clock.now_ns(), reaction_s))
+        observation = observe(seen, track, vehicle, guardian, clock.now_ns(), reaction_s)
+        topics.observation.publish(observation)
+        command = strategy.decide(observation)
         topics.command.publish(command)
         guardian.gate.renew(Lease.MISSION, command.expires_ns)
         if command.intent in (Intent.DONE, Intent.REFUSE):

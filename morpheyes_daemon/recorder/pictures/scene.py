@@ -5,7 +5,8 @@ Plain shapes in ned metres, so that the recorder needs no world model.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,3 +37,19 @@ class Scene:
     def disc_array(self) -> NDArray[np.float64]:
         """Return the discs as (N, 3): north, east, radius."""
         return np.array([(d.x_m, d.y_m, d.radius_m) for d in self.discs], dtype=np.float64).reshape(-1, 3)
+
+    def as_json(self) -> str:
+        """Return the scene as text, for the header of a log."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Scene:
+        """Return the scene of `as_json`."""
+        plain = json.loads(text)
+        start, goal = plain["start_m"], plain["goal_m"]
+        return cls(
+            discs=tuple(Disc(**disc) for disc in plain["discs"]),
+            polygons=tuple(tuple((x, y) for x, y in corners) for corners in plain["polygons"]),
+            start_m=None if start is None else (start[0], start[1]),
+            goal_m=None if goal is None else (goal[0], goal[1]),
+        )
