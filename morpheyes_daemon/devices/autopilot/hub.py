@@ -21,7 +21,7 @@ from morpheyes_daemon.devices.autopilot.echo import EchoWatch
 from morpheyes_daemon.devices.autopilot.parameters import ParameterClient
 from morpheyes_daemon.devices.autopilot.rates import STREAMS, request_streams
 from morpheyes_daemon.devices.autopilot.telemetry import Telemetry
-from morpheyes_daemon.devices.autopilot.transmitter import Transmitter
+from morpheyes_daemon.devices.autopilot.transmitter import Transmitter, may_relay
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceTimeoutError
 from morpheyes_daemon.messages import Event, VehicleState
@@ -69,6 +69,7 @@ class AutopilotHub:
         self._gcs = Identity(config.gcs_sysid, config.gcs_compid)
         self._signing = signing
         self._decoder = Decoder(signing)
+        self._relayed = Decoder()
         self._telemetry = Telemetry()
         self._echo = EchoWatch()
         self._echo_lost = False
@@ -118,6 +119,10 @@ class AutopilotHub:
         """Call `callback` with every frame that passed the checks (for mavsdk)."""
         self._on_frame.append(callback)
 
+    def forget_frames(self, callback: Callable[[bytes], None]) -> None:
+        """Undo `on_frame`."""
+        self._on_frame = [listener for listener in self._on_frame if listener != callback]
+
     # -- what others send ---------------------------------------------------------------------------------------
 
     def claim_stick_output(self) -> Callable[[ChannelOverride], None]:
@@ -144,6 +149,12 @@ class AutopilotHub:
         """Send the nearest obstacle of 72 sectors (see wire/obstacle_distance.py); call at 10 Hz or more."""
         message = obstacle_distance_message(sectors_m, h_fov_rad, max_m, self._clock.now_ns())
         self.transmitter.send(message, self.transmitter.proximity)
+
+    def relay(self, data: bytes) -> None:
+        """Send on what mavsdk wants to say, except heartbeats, sticks and message rates, which are ours."""
+        for message in self._relayed.feed(data):
+            if may_relay(message):
+                self.transmitter.send(message, source(message))
 
     async def send_command(self, command: int, *parameters: float) -> None:
         """Send a MAV_CMD and wait until it is accepted; raises DeviceError or DeviceTimeoutError."""

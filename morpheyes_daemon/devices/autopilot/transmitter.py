@@ -24,6 +24,17 @@ from morpheyes_daemon.wire.mavlink import (
 STICK_MESSAGES = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL", "RADIO_RC_CHANNELS"})
 """Messages that move the sticks."""
 
+RELAY_REFUSES = STICK_MESSAGES | {"HEARTBEAT", "TIMESYNC", "PING"}
+"""What is never sent on for somebody else."""
+
+
+def may_relay(message: Message) -> bool:
+    """Return whether a message of mavsdk may go out; message rates are the hub's alone."""
+    kind = message.get_type()
+    if kind in ("COMMAND_LONG", "COMMAND_INT"):
+        return bool(message.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
+    return kind not in RELAY_REFUSES
+
 
 class Transmitter:
     """Packs, numbers, signs and writes; without a link what is sent is lost, as on any radio."""
