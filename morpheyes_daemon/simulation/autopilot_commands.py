@@ -12,6 +12,7 @@ from typing import Protocol
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.simulation.autopilot_core import Autopilot
+from morpheyes_daemon.simulation.aux_switches import AuxFunction, Position
 from morpheyes_daemon.simulation.flight_modes import Mode
 
 ACCEPTED = int(mavlink.MAV_RESULT_ACCEPTED)
@@ -20,9 +21,6 @@ UNSUPPORTED = int(mavlink.MAV_RESULT_UNSUPPORTED)
 FAILED = int(mavlink.MAV_RESULT_FAILED)
 
 _FORCE = 21196
-_AUX_AVOIDANCE = 40
-_AUX_STOP_RC_OVERRIDE = 46
-_HIGH, _LOW = 2, 0
 
 
 class StreamTarget(Protocol):
@@ -83,14 +81,12 @@ class Commands:
         return ACCEPTED if self._autopilot.take_off(params[6]) else FAILED
 
     def _aux_function(self, params: Sequence[float]) -> int:
-        function, position = int(params[0]), int(params[1])
-        if function == _AUX_AVOIDANCE and position in (_LOW, _HIGH):
-            self._autopilot.avoidance = position == _HIGH
-            return ACCEPTED
-        if function == _AUX_STOP_RC_OVERRIDE and position in (_LOW, _HIGH):
-            self._autopilot.enable_overrides(enabled=position == _HIGH)
-            return ACCEPTED
-        return FAILED
+        try:
+            function, position = AuxFunction(int(params[0])), Position(int(params[1]))
+        except ValueError:
+            return FAILED
+        self._autopilot.switch(function, position)
+        return ACCEPTED
 
     def _preflight_reboot(self, params: Sequence[float]) -> int:
         if params[0] != 1.0 or (self._autopilot.armed and params[5] != _FORCE):

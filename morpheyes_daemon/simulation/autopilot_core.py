@@ -12,6 +12,7 @@ from enum import IntEnum
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.simulation.autopilot_parameters import ParameterTable
+from morpheyes_daemon.simulation.aux_switches import AuxFunction, AuxSwitches, Position
 from morpheyes_daemon.simulation.battery import Battery
 from morpheyes_daemon.simulation.estimator import Estimate, Estimator, EstimatorNoise
 from morpheyes_daemon.simulation.flight_control import FlightControl
@@ -21,12 +22,14 @@ from morpheyes_daemon.simulation.vehicle import STEP_NS, Vehicle
 
 TICK_NS = 10 * MS
 _STEPS = TICK_NS // STEP_NS
-_STICK_DEAD_TICKS = 2
-"""Dead time between a stick and the first reaction, 0.02 s (field facts, the fitted model)."""
+_STICK_DEAD_TICKS = 3
+"""From an override to the first reaction; with the lean response this gives the measured 55-70 ms and 0.2 s."""
 
 _EKF_COUNTS = 10
 _EKF_PERIOD_NS = 100 * MS
 _THROTTLE_LOW = 0.0
+_LAND_WAIT_S = 4.0
+"""A failsafe's LAND hovers this long before it descends."""
 
 
 class Severity(IntEnum):
@@ -115,6 +118,7 @@ class Autopilot:
         self.boot_ns = t_ns
         self.control.disarm()
         self.rc = RcInput(self.table, self.radio)
+        self._switches = AuxSwitches(self.table)
         self.estimator.boot(t_ns)
         self.gcs_seen_ns = None
         self._gcs_lost, self._ekf_failed, self._ekf_bad = False, False, 0
@@ -134,6 +138,7 @@ class Autopilot:
         self.estimator.advance(self.t_ns, TICK_NS / S)
         self.battery.advance(TICK_NS / S, flying=not self.control.landed and self.armed)
         self.control.has_position = self.estimator.has_position
+        self.control.dead_reckons = self.estimator.dead_reckons
         self.control.drift_m = (self.estimator.drift_m[0], self.estimator.drift_m[1])
 
     def _refresh_settings(self) -> None:
@@ -152,6 +157,8 @@ class Autopilot:
             mode = _known_mode(self.table[f"FLTMODE{position}"])
             if mode is not None:
                 self.set_mode(mode)
+        for function, switched in self._switches.changes(self.t_ns, self.rc.channels_us):
+            self.switch(function, switched)
         self._delayed.append(self.rc.pilot())
 
     def _watch(self) -> None:
@@ -162,13 +169,16 @@ class Autopilot:
         self._watch_landing()
         self._watch_idling()
 
-    def set_mode(self, mode: Mode) -> bool:
-        """Change the flight mode; refused where a position is needed and there is none."""
+    def set_mode(self, mode: Mode, wait_s: float = 0.0) -> bool:
+        """Change the flight mode; refused where a position is needed and there is none.
+
+        `wait_s` holds back the descent of LAND.
+        """
         if mode.needs_position and not self.estimator.has_position:
             self._say(Severity.WARNING, f"Mode change to {mode.name} failed: requires position")
             return False
         if mode is not self.mode:
-            self.control.set_mode(mode)
+            self.control.set_mode(mode, wait_s)
         return True
 
     def arm(self) -> str | None:
@@ -222,9 +232,14 @@ class Autopilot:
         self.control.take_off(height_m)
         return True
 
-    def enable_overrides(self, *, enabled: bool) -> None:
-        """Accept overrides or refuse them (aux function 46); refusing clears the present ones."""
-        self.rc.accept_overrides(enabled=enabled)
+    def switch(self, function: AuxFunction, position: Position) -> None:
+        """Carry out an auxiliary function; the middle position changes nothing."""
+        if position is Position.MIDDLE:
+            return
+        if function is AuxFunction.AVOID_PROXIMITY:
+            self.avoidance = position is Position.HIGH
+        elif function is AuxFunction.RC_OVERRIDE_ENABLE:
+            self.rc.accept_overrides(enabled=position is Position.HIGH)
 
     def see_gcs(self) -> None:
         """Note a sign of life of the ground station: its heartbeat, or any accepted override."""
@@ -241,8 +256,8 @@ class Autopilot:
             return
         if self.control.landed:
             self._stop_motors()
-        elif not self.set_mode(mode):
-            self.set_mode(Mode.LAND)
+        elif not self.set_mode(mode, _LAND_WAIT_S):
+            self.set_mode(Mode.LAND, _LAND_WAIT_S)
 
     def _watch_gcs(self) -> None:
         enabled = int(self.table["FS_GCS_ENABLE"])

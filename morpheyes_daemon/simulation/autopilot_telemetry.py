@@ -54,7 +54,7 @@ def _attitude(autopilot: Autopilot) -> Message:
 
 
 def _local_position(autopilot: Autopilot) -> Message | None:
-    if not autopilot.estimator.has_position:
+    if not autopilot.estimator.dead_reckons:
         return None
     e = autopilot.estimate
     return mavlink.MAVLink_local_position_ned_message(autopilot.boot_ms, *e.p_ned_m, *e.v_ned_m_s)

@@ -41,12 +41,18 @@ _WITH_GPS = (
     | Ekf.PRED_POS_HORIZ_REL
     | Ekf.PRED_POS_HORIZ_ABS
 )
+_COASTING = _COMMON | Ekf.VELOCITY_HORIZ | Ekf.POS_VERT_AGL
 _WITH_FLOW = _COMMON | Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.POS_VERT_AGL | Ekf.PRED_POS_HORIZ_REL
 
 _AIDING_TIMEOUT_NS = round(0.9 * S)
 """How long the EKF coasts without aiding; with the failsafe's ten counts at 10 Hz this gives the measured 1.9 s."""
 
+_DEAD_RECKONING_NS = 5 * S
+"""How long velocity and position go on to be reported after the aiding is lost."""
+
 _FLOW_START_NS = 2 * S
+_UNAIDED_M_S_SQRT_S = 0.1
+"""How fast the velocity estimate walks away without aiding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +112,7 @@ class Estimator:
         self._ready_after_ns = round(ready_after_s * S)
         self._origin_ns: int | None = None
         self._aiding_lost_ns: int | None = None
+        self._unaided_m_s = [0.0, 0.0]
         self.variance = 0.05
         self._t_ns = 0
 
@@ -133,14 +140,16 @@ class Estimator:
     def regain_aiding(self) -> None:
         """The sensor delivers again."""
         self._aiding_lost_ns = None
+        self._unaided_m_s = [0.0, 0.0]
 
     def _warm(self) -> bool:
         return self._t_ns - self._boot_ns >= self._ready_after_ns
 
-    def _aided(self) -> bool:
-        lost = self._aiding_lost_ns
-        if lost is not None and self._t_ns - lost >= _AIDING_TIMEOUT_NS:
-            return False
+    def _lost_for(self, time_ns: int) -> bool:
+        return self._aiding_lost_ns is not None and self._t_ns - self._aiding_lost_ns >= time_ns
+
+    def _started(self) -> bool:
+        """The EKF has once been given all it needs."""
         if not self._table.flow_only:
             return self._warm()
         waited = self._origin_ns is not None and self._t_ns - self._origin_ns >= _FLOW_START_NS
@@ -149,14 +158,21 @@ class Estimator:
     @property
     def flags(self) -> Ekf:
         """Return EKF_STATUS_REPORT.flags."""
-        if not self._aided():
+        if not self._started() or self._lost_for(_DEAD_RECKONING_NS):
             return _WAITING
+        if self._lost_for(_AIDING_TIMEOUT_NS):
+            return _COASTING
         return _WITH_FLOW if self._table.flow_only else _WITH_GPS
 
     @property
     def has_position(self) -> bool:
         """Position control is possible."""
         return bool(self.flags & Ekf.POS_HORIZ_REL)
+
+    @property
+    def dead_reckons(self) -> bool:
+        """Velocity and position are still reported and flown on, perhaps without aiding."""
+        return self._started() and not self._lost_for(_DEAD_RECKONING_NS)
 
     @property
     def healthy(self) -> bool:
@@ -171,17 +187,25 @@ class Estimator:
         kick = self.noise.drift_m_sqrt_s * math.sqrt(dt_s)
         self.drift_m[0] += kick * self._random.gauss()
         self.drift_m[1] += kick * self._random.gauss()
+        if self._aiding_lost_ns is not None:
+            self._walk_away(dt_s)
+
+    def _walk_away(self, dt_s: float) -> None:
+        kick = _UNAIDED_M_S_SQRT_S * math.sqrt(dt_s)
+        for axis in (0, 1):
+            self._unaided_m_s[axis] += kick * self._random.gauss()
+            self.drift_m[axis] += self._unaided_m_s[axis] * dt_s
 
     def estimate(self) -> Estimate:
         """Return what the autopilot reports now."""
         t_ns = self._vehicle.t_ns - self.noise.delay_ns
         truth, before = self._vehicle.truth_at(t_ns), self._vehicle.truth_at(t_ns - 10_000_000)
-        v, e = truth.v_ned_m_s, self._velocity.values
+        v, e, walk = truth.v_ned_m_s, self._velocity.values, self._unaided_m_s
         p, drift = truth.p_ned_m, self.drift_m
         errors = self._attitude.values
         return Estimate(
             p_ned_m=(p[0] + drift[0], p[1] + drift[1], p[2] + drift[2]),
-            v_ned_m_s=(v[0] + e[0], v[1] + e[1], v[2] + e[2]),
+            v_ned_m_s=(v[0] + e[0] + walk[0], v[1] + e[1] + walk[1], v[2] + e[2]),
             roll_rad=truth.roll_rad + errors[0],
             pitch_rad=truth.pitch_rad + errors[1],
             yaw_rad=_wrapped(truth.yaw_rad + errors[2]),

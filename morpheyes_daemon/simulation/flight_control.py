@@ -21,8 +21,8 @@ from morpheyes_daemon.simulation.loiter_plant import (
 from morpheyes_daemon.simulation.radio import PilotInput
 from morpheyes_daemon.simulation.vehicle import STEP_S, Vehicle
 
-_BRAKE_ACCEL_M_S2 = 2.0
-_BRAKE_JERK_M_S3 = 2.0
+_BRAKE_ACCEL_M_S2 = 1.6
+_BRAKE_JERK_M_S3 = 1.6
 """Fitted to the measured stop of BRAKE mode (field facts: 3.6 s and 5.2 m from 3 m/s)."""
 
 _HEIGHT_P_1_S = 1.0
@@ -51,6 +51,7 @@ class FlightControl:
         self.armed = False
         self.landed = True
         self.has_position = False
+        self.dead_reckons = False
         self.drift_m = (0.0, 0.0)
         self.home_ne_m = (0.0, 0.0)
         self._armed_s = 0.0
@@ -63,6 +64,8 @@ class FlightControl:
         self._takeoff_m: float | None = None
         self._phase = Phase.CLIMB
         self._phase_s = 0.0
+        self._wait_s = 0.0
+        self._blind = False
 
     def arm(self) -> None:
         """Start the motors; they need a moment to spin up."""
@@ -74,9 +77,11 @@ class FlightControl:
         """Stop the motors, in the air too."""
         self.armed = False
 
-    def set_mode(self, mode: Mode) -> None:
-        """Change the flight mode and start its motion from the present one."""
+    def set_mode(self, mode: Mode, wait_s: float = 0.0) -> None:
+        """Change the flight mode and start its motion from the present one; LAND descends after `wait_s`."""
         self.mode = mode
+        self._wait_s = wait_s
+        self._blind = not self.has_position
         self._takeoff_m = None
         self._phase, self._phase_s = Phase.CLIMB, 0.0
         self._start_horizontal()
@@ -168,6 +173,8 @@ class FlightControl:
         return max(-self.settings.land_m_s, min(self.settings.takeoff_m_s, off))
 
     def _descent_m_s(self) -> float:
+        if self.mode is Mode.LAND and self._phase_s < self._wait_s:
+            return 0.0
         high = self._vehicle.height_m > self.settings.land_low_m
         return -(self.settings.descend_m_s if high else self.settings.land_m_s)
 
@@ -205,7 +212,7 @@ class FlightControl:
         """Return the lean, forward and right."""
         if self.mode in (Mode.STABILIZE, Mode.ALT_HOLD):
             return _lean(pilot, self.settings.angle_rad)
-        if not self.has_position:
+        if not self.dead_reckons or (self._blind and self.mode is Mode.LAND):
             return 0.0, 0.0
         heading = math.cos(self._vehicle.yaw_rad), math.sin(self._vehicle.yaw_rad)
         return self._follow(self._reference(pilot, heading), heading)

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 GRAVITY_M_S2 = 9.80665
 
-BRAKE_GAIN_1_S = 1.0
-"""Half of PSC_VELXY_P, as AC_Loiter takes it."""
+BRAKE_GAIN_1_S = 1.06
+"""AC_Loiter takes half of PSC_VELXY_P, 1.0; recorded brakes fit best with this."""
 
 LEAN_LAG_S = 0.075
 """Both poles of the lean response; from recorded steps."""
@@ -179,8 +179,8 @@ class VelocityReference(Reference):
 class Tracking:
     """AC_PosControl along one axis: P on position, PID on velocity, the reference's acceleration ahead.
 
-    Gains are ArduCopter's defaults (PSC_POSXY_P, PSC_VELXY_P, _I, _D, _FLTE); with them and an airframe drag of
-    0.34/s recorded stops from 3 m/s are reproduced to 0.02 m/s rms.
+    Gains are ArduCopter's defaults (PSC_POSXY_P, PSC_VELXY_P, _I, _D); the error's filter and the airframe's drag are
+    fitted to recorded stops from 3 m/s, which are then reproduced to 0.02 m/s rms.
     """
 
     __slots__ = ("_derivative", "_error", "_integral")
@@ -189,7 +189,8 @@ class Tracking:
     VELOCITY_P_1_S = 2.0
     VELOCITY_I_1_S2 = 1.0
     VELOCITY_D = 0.25
-    FILTER_HZ = 5.0
+    FILTER_HZ = 30.0
+    FILTER_D_HZ = 5.0
 
     def __init__(self) -> None:
         self._error = self._derivative = self._integral = 0.0
@@ -202,10 +203,10 @@ class Tracking:
     def step(self, offset_m: float, v_offset_m_s: float, a_wanted_m_s2: float, dt_s: float) -> float:
         """Return the acceleration to ask for; offsets are wanted minus present."""
         raw = v_offset_m_s + self.POSITION_P_1_S * max(-2.0, min(2.0, offset_m))
-        follow = dt_s / (dt_s + 1.0 / (2.0 * math.pi * self.FILTER_HZ))
         before = self._error
-        self._error += (raw - self._error) * follow
-        self._derivative += ((self._error - before) / dt_s - self._derivative) * follow
+        self._error += (raw - self._error) * dt_s / (dt_s + 1.0 / (2.0 * math.pi * self.FILTER_HZ))
+        slope = (self._error - before) / dt_s
+        self._derivative += (slope - self._derivative) * dt_s / (dt_s + 1.0 / (2.0 * math.pi * self.FILTER_D_HZ))
         self._integral += self.VELOCITY_I_1_S2 * self._error * dt_s
         pid = self.VELOCITY_P_1_S * self._error + self._integral + self.VELOCITY_D * self._derivative
         return a_wanted_m_s2 + pid
