@@ -146,7 +146,7 @@ class Gate:
 
     def stale(self, now_ns: int) -> Lease | None:
         """Return the gravest lease that has run out, None when all are fresh."""
-        return next((lease for lease in Lease if not self.is_fresh(lease, now_ns)), None)
+        return next((lease for lease in self._expiry if not self.is_fresh(lease, now_ns)), None)
 
     def offer(self, sticks: Sticks) -> None:
         """Put stick positions before the gate; they count until they expire or a step lets no stick through."""
@@ -178,8 +178,8 @@ class Gate:
         self._pause_ns = now_ns - self._stepped_ns
         if state is not self._state or not 0 <= self._pause_ns <= LATE_NS:
             self._offer = None
-        for lease in Lease:
-            if self._expiry[lease] > now_ns + LONGEST_LEASE_NS:
+        for lease, expires_ns in self._expiry.items():
+            if expires_ns > now_ns + LONGEST_LEASE_NS:
                 self.revoke(lease)
         self._state, self._stepped_ns = state, now_ns
 
@@ -210,9 +210,7 @@ class Gate:
         self._release_ns = now_ns
         self._releases = 0
 
-    def _send(
-        self, state: State, action: Action, reason: Reason | None, widths: Widths, now_ns: int
-    ) -> GateOutput:
+    def _send(self, state: State, action: Action, reason: Reason | None, widths: Widths, now_ns: int) -> GateOutput:
         self._release_ns = None
         self._sent = widths
         return self._out(GateOutput(now_ns, state, action, reason, *widths))

@@ -25,11 +25,11 @@ LOITER = 5
 AT_REST_M_S = 0.15
 """Below this the vehicle counts as stopped; the velocity's own noise is about 0.05 m/s."""
 
-IDLE_S = 0.5
+IDLE_S = 1.0
 """ENGAGED without a stick let through for this long means that whoever should fly does not."""
 
-PAUSE_S = 1.0
-"""Stick periods further apart than this: the autopilot may long have taken the sticks from us."""
+PAUSE_S = 0.5
+"""Stick periods further apart than this: meanwhile nobody listened to the pilot."""
 
 RESUMED = frozenset(
     {
@@ -197,7 +197,7 @@ class Guardian:
     def _renew_vehicle(self, vehicle: VehicleState) -> None:
         oldest = min(vehicle.attitude_t_ns, vehicle.position_t_ns)
         angles = (vehicle.roll_rad, vehicle.pitch_rad, vehicle.yaw_rad)
-        if oldest and all(math.isfinite(x) for x in (*angles, *vehicle.p_ned_m, *vehicle.v_ned_m_s)):
+        if oldest and math.isfinite(sum((*angles, *vehicle.p_ned_m, *vehicle.v_ned_m_s))):
             self.gate.renew(Lease.VEHICLE, oldest + round(self._limits.vehicle_timeout_s * S))
 
     def _hear_switch(self, vehicle: VehicleState, now_ns: int) -> None:

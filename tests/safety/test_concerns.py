@@ -1,0 +1,56 @@
+"""What the autopilot says about itself that forbids to fly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from morpheyes_daemon.clock import S
+from morpheyes_daemon.messages import VehicleState
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.safety.concerns import concern
+
+NOW_NS = 1000 * S
+WELL = VehicleState(system_status=4, ekf_t_ns=1, ekf_flags=0x08, battery_fraction=0.8, gcs_t_ns=NOW_NS)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({}, None),
+        ({"system_status": 3}, None),
+        ({"system_status": 5}, Reason.FAILSAFE),
+        ({"system_status": 6}, Reason.FAILSAFE),
+        ({"ekf_flags": 0x10}, None),
+        ({"ekf_flags": 0x33F}, None),
+        ({"ekf_flags": 0x08 | 0x80}, Reason.EKF_UNHEALTHY),
+        ({"ekf_flags": 0x07}, Reason.EKF_UNHEALTHY),
+        ({"ekf_flags": 0x20}, Reason.EKF_UNHEALTHY),
+        ({"ekf_flags": 0}, Reason.EKF_UNHEALTHY),
+        ({"ekf_t_ns": 0}, Reason.EKF_UNHEALTHY),
+        ({"battery_fraction": 0.2}, None),
+        ({"battery_fraction": 0.19}, Reason.BATTERY_LOW),
+        ({"battery_fraction": 0.0}, Reason.BATTERY_LOW),
+        ({"battery_fraction": math.nan}, None),
+        ({"battery_fraction": -0.01}, None),
+        ({"gcs_t_ns": NOW_NS - 5 * S + 1}, None),
+        ({"gcs_t_ns": NOW_NS - 5 * S}, Reason.GCS_LOST),
+        ({"gcs_t_ns": 0}, Reason.GCS_LOST),
+        ({"system_status": 5, "ekf_flags": 0}, Reason.FAILSAFE),
+        ({"ekf_flags": 0, "battery_fraction": 0.1}, Reason.EKF_UNHEALTHY),
+        ({"battery_fraction": 0.1, "gcs_t_ns": 0}, Reason.BATTERY_LOW),
+    ],
+)
+def test_each_concern(changes: dict[str, Any], reason: Reason | None) -> None:
+    assert concern(replace(WELL, **changes), NOW_NS, battery_low=0.2, gcs_timeout_s=5.0) is reason
+
+
+def test_the_ground_station_is_watched_only_when_asked() -> None:
+    assert concern(replace(WELL, gcs_t_ns=0), NOW_NS, battery_low=0.2, gcs_timeout_s=None) is None
+
+
+def test_a_vehicle_never_heard_is_not_healthy() -> None:
+    assert concern(VehicleState(), NOW_NS, 0.2, None) is Reason.EKF_UNHEALTHY
