@@ -256,7 +256,8 @@ def _mapped_axes(parameters: Mapping[str, float]) -> tuple[StickAxis, StickAxis,
     names = ("RCMAP_ROLL", "RCMAP_PITCH", "RCMAP_THROTTLE", "RCMAP_YAW")
     numbers = [round(p.Quantity(((name, 1.0),)).read(parameters)) for name in names]
     if sorted(numbers) != [1, 2, 3, 4]:
-        raise DeviceError(f"RCMAP_* put the sticks on channels {numbers}: they must be on channels 1 to 4.")
+        found = ", ".join(f"{name} {number}" for name, number in zip(names, numbers, strict=True))
+        raise DeviceError(f"The four sticks must be on channels 1 to 4, but it has {found}.")
     roll, pitch, throttle, yaw = (StickAxis.from_parameters(parameters, number) for number in numbers)
     return roll.require_centred(), pitch.require_centred(), throttle, yaw.require_centred()
 

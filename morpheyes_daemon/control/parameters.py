@@ -40,6 +40,11 @@ class Quantity:
             raise DeviceError(f"The autopilot has no parameter {names}: check that it runs ArduCopter 4.0 or newer.")
         return self.default
 
+    def change(self, parameters: Mapping[str, float], si: float) -> dict[str, float]:
+        """Return {name: value} that sets it on this autopilot, in the name and unit of its generation."""
+        name, factor = next((row for row in self.names if row[0] in parameters), self.names[0])
+        return {name: round(si / factor, 9)}
+
 
 LOIT_SPEED = Quantity((("LOIT_SPEED", CENTI), ("LOIT_SPEED_MS", 1.0)))
 LOIT_ANG_MAX = Quantity((("LOIT_ANG_MAX", DEG),), 0.0)
@@ -54,6 +59,7 @@ PILOT_SPEED_DN = Quantity((("PILOT_SPEED_DN", CENTI), ("PILOT_SPD_DN", 1.0)), 0.
 THR_DZ = Quantity((("THR_DZ", 1e-3), ("PILOT_THR_DZ", 1e-3)), 0.1)
 FLOW_RATE = Quantity((("EK3_MAX_FLOW", 1.0), ("EK3_FLOW_MAX", 1.0)), 2.5)
 VELOCITY_SOURCE = Quantity((("EK3_SRC1_VELXY", 1.0),), 3.0)
+RTL_ALTITUDE = Quantity((("RTL_ALT", CENTI), ("RTL_ALT_M", 1.0)), 15.0)
 GCS_SYSID = Quantity((("MAV_GCS_SYSID", 1.0), ("SYSID_MYGCS", 1.0)))
 
 OPTICAL_FLOW = 5
