@@ -14,13 +14,13 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from morpheyes_daemon.errors import InputError, UsageError
+from morpheyes_daemon.calibration.saddle import saddle_points
+from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.messages import Image
 from morpheyes_daemon.transforms import Array
 
-_WINDOW_SHARE = 0.34
+_WINDOW_SHARE = 0.3
 """Half width of the sub-pixel window as a share of the distance to the nearest corner: the next edge stays out."""
 _WINDOW_LIMITS_PX = (2, 11)
 _REFINE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
@@ -76,6 +76,23 @@ class Board:
             return f"charuco:{self.columns + 1}x{self.rows + 1}:{self.dictionary}"
         return f"{self.columns}x{self.rows}"
 
+    def picture(self, pixels_per_square: int, margin_squares: float = 1.0) -> tuple[Image, Array]:
+        """Return a picture of the board (H, W) and the pixel of every inner corner (columns * rows, 2) in it.
+
+        The margin is white paper. Used for rendering and for printing.
+        """
+        margin = round(margin_squares * pixels_per_square)
+        columns, rows = self.columns + 1, self.rows + 1
+        if self.kind == "charuco":
+            size = (columns * pixels_per_square, rows * pixels_per_square)
+            inner = np.asarray(_charuco(self).generateImage(size), dtype=np.uint8)
+        else:
+            dark = np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0
+            inner = np.where(np.kron(dark, np.ones((pixels_per_square,) * 2)), 0, 255).astype(np.uint8)
+        picture = np.pad(inner, margin, constant_values=255)
+        corners = (self.points_m[:, :2] / self.square_m + 1.0) * pixels_per_square + margin - 0.5
+        return picture, corners
+
 
 def parse_board(text: str, square_m: float, marker_m: float | None = None) -> Board:
     """Return the board of `9x6` (inner corners) or `charuco:10x7[:5X5_1000]` (squares); raises UsageError."""
@@ -121,24 +138,6 @@ def aligned(left: Array, right: Array, board: Board) -> Array:
     return turns[int(np.argmax([axis @ wanted for axis in axes]))]
 
 
-def draw_board(board: Board, pixels_per_square: int, margin_squares: float = 1.0) -> tuple[Image, Array]:
-    """Return a picture of the board (H, W) and the pixel of every inner corner (columns * rows, 2) in it.
-
-    The margin is white paper. Used for rendering and for printing.
-    """
-    margin = round(margin_squares * pixels_per_square)
-    columns, rows = board.columns + 1, board.rows + 1
-    size = (columns * pixels_per_square, rows * pixels_per_square)
-    if board.kind == "charuco":
-        inner = np.asarray(_charuco(board).generateImage(size), dtype=np.uint8)
-    else:
-        dark = np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0
-        inner = np.where(np.kron(dark, np.ones((pixels_per_square,) * 2)), 0, 255).astype(np.uint8)
-    picture = np.pad(inner, margin, constant_values=255)
-    corners = (board.points_m[:, :2] / board.square_m + 1.0) * pixels_per_square + margin - 0.5
-    return picture, corners
-
-
 def _find_chessboard(picture: Image, board: Board) -> Array | None:
     size = (board.columns, board.rows)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
@@ -170,11 +169,11 @@ def _refined(picture: Image, corners: Array, board: Board) -> Array:
     """Move each corner to its saddle point, in a window as wide as its neighbours allow."""
     half = np.clip(np.round(_WINDOW_SHARE * _spacing(corners, board)), *_WINDOW_LIMITS_PX)
     refined = corners.copy()
-    for window in np.unique(half[np.isfinite(half)]):
+    for window in np.unique(half[np.isfinite(half)]).astype(int):
         chosen = half == window
         start = corners[chosen].astype(np.float32).reshape(-1, 1, 2)
-        moved = cv2.cornerSubPix(picture, start, (int(window), int(window)), (-1, -1), _REFINE)
-        refined[chosen] = moved.reshape(-1, 2)
+        near = cv2.cornerSubPix(picture, start, (window, window), (-1, -1), _REFINE).reshape(-1, 2)
+        refined[chosen], _ = saddle_points(picture, near.astype(np.float64), int(window))
     return refined
 
 
@@ -210,16 +209,3 @@ def _turns(corners: Array, board: Board) -> list[Array]:
 def _axis(corners: Array, board: Board) -> Array:
     grid = corners.reshape(board.rows, board.columns, 2)
     return np.asarray(np.mean(grid[:, -1] - grid[:, 0], axis=0))
-
-
-def require_size(image: Image, size: tuple[int, int], name: str) -> None:
-    """Raise InputError naming the image when it has another (width, height) than the rest."""
-    found = (image.shape[1], image.shape[0])
-    if found != size:
-        raise InputError(
-            f"{name}: is {found[0]}x{found[1]} px where the others are {size[0]}x{size[1]}; "
-            "take all pictures at one size, or move it away."
-        )
-
-
-Mask = NDArray[np.bool_]

@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.projection import project
 from morpheyes_daemon.calibration.views import Observations
@@ -121,7 +122,7 @@ class _System:
     coupling: Array
     own: Array
     own_gradient: Array
-    columns: np.ndarray[tuple[int, int], np.dtype[np.intp]]
+    columns: NDArray[np.intp]
 
 
 def _points(observations: Observations, state: RigState) -> tuple[Array, Array, Array, Array]:
@@ -153,7 +154,7 @@ def _linearise(observations: Observations, state: RigState, sigma_px: float) -> 
     )
 
 
-def _columns(baseline: np.ndarray[tuple[int], np.dtype[np.intp]]) -> np.ndarray[tuple[int, int], np.dtype[np.intp]]:
+def _columns(baseline: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return which shared unknowns (V, 26) each view touches."""
     eyes = np.broadcast_to(np.arange(EYES), (len(baseline), EYES))
     return np.concatenate([eyes, EYES + POSE * baseline[:, None] + np.arange(POSE)], axis=1)

@@ -29,7 +29,8 @@ class Coverage:
 
 def coverage(observations: Observations) -> Coverage:
     """Return where both eyes saw corners over all views."""
-    return Coverage(count_cells(observations.left, observations.size), count_cells(observations.right, observations.size))
+    size = observations.size
+    return Coverage(count_cells(observations.left, size), count_cells(observations.right, size))
 
 
 def count_cells(pixels: Array, size: tuple[int, int]) -> NDArray[np.int64]:

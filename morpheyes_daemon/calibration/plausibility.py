@@ -17,6 +17,8 @@ from morpheyes_daemon.transforms import Array
 
 SCALE_TOLERANCE = 0.03
 """Linear servos with a 1 % stroke error and a ruler's reading stay well within this of the names."""
+ONE_LENGTH_TOLERANCE = 0.10
+"""For a single baseline: what is written on a rig is the distance of its lenses' housings, give or take."""
 NAME_TOLERANCE_M = 8e-3
 """How far one baseline may lie from where its name puts it among the others; the paper's rail is within 1.83 mm."""
 
@@ -32,22 +34,24 @@ class ScaleCheck:
     square_mm: float
     square_scatter_mm: float
     length_ratio: float | None
+    baselines: int = 1
 
     @property
     def disagrees(self) -> bool:
         """The square size and the folders' names cannot both be right."""
-        return self.length_ratio is not None and abs(self.length_ratio - 1.0) > SCALE_TOLERANCE
+        limit = SCALE_TOLERANCE if self.baselines > 1 else ONE_LENGTH_TOLERANCE
+        return self.length_ratio is not None and abs(self.length_ratio - 1.0) > limit
 
 
 def scale_check(calibration: Calibration) -> ScaleCheck:
     """Return both scale checks of a calibration."""
     squares = np.concatenate([_squares_m(calibration, index) for index in range(len(calibration.nominal_m))])
     ratio = length_ratio(calibration.observations.nominal_m, calibration.lengths_m)
-    return ScaleCheck(float(np.mean(squares) * 1e3), float(np.std(squares) * 1e3), ratio)
+    return ScaleCheck(float(np.mean(squares) * 1e3), float(np.std(squares) * 1e3), ratio, len(calibration.nominal_m))
 
 
 def length_ratio(nominal_m: Array, lengths_m: Array) -> float | None:
-    """Return by what the solved lengths (M,) grow per nominal metre, unmoved by a few misnamed folders (Theil-Sen)."""
+    """Return by what the lengths (M,) grow per nominal metre, unmoved by a few misnamed folders (Theil-Sen)."""
     if not np.all(np.isfinite(nominal_m)):
         return None
     if len(nominal_m) == 1:

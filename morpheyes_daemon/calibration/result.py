@@ -1,14 +1,58 @@
-"""A calibration as the rig model that the daemon reads, with everything a person may want to know of it beside."""
+"""A solved calibration with all its figures: what `--json` prints, and the rig model with details for the file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from morpheyes_daemon.calibration.coverage import CELLS, cell_of, coverage
+from morpheyes_daemon.calibration.plausibility import ScaleCheck
 from morpheyes_daemon.calibration.projection import camera_from_vector
 from morpheyes_daemon.calibration.solver import Calibration
-from morpheyes_daemon.calibration.uncertainty import baseline_uncertainty
+from morpheyes_daemon.calibration.uncertainty import BaselineUncertainty, baseline_uncertainty, camera_uncertainty
+from morpheyes_daemon.calibration.validation import HeldOut, LeftOutBaseline
+from morpheyes_daemon.calibration.verdict import Verdict
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A calibration, how it did on boards it had not seen, what to think of it, and the rig model with all of it."""
+
+    calibration: Calibration
+    held_out: HeldOut
+    left_out: list[LeftOutBaseline]
+    uncertainty: list[BaselineUncertainty]
+    scale: ScaleCheck
+    verdict: Verdict
+    problems: tuple[str, ...]
+    rig: RigModel
+
+    def figures(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        calibration = self.calibration
+        return {
+            "nominal_mm": _rounded(calibration.nominal_m * 1e3, 4),
+            "baselines_mm": _rounded(calibration.lengths_m * 1e3, 4),
+            "rms_px": _rounded(calibration.rms_px, 4),
+            "epipolar_median_px": round(self.held_out.median_px, 4),
+            "epipolar_p95_px": round(self.held_out.p95_px, 4),
+            "leave_one_out": [_left_out_row(one) for one in self.left_out],
+            "outliers": [outlier.name for outlier in calibration.outliers],
+            "verdict": self.verdict.text,
+            "retake": list(self.verdict.retake),
+            "problems": list(self.problems),
+            "sigma_length_mm": _rounded([u.length_m * 1e3 for u in self.uncertainty], 4),
+            "sigma_disparity_px": _rounded([u.disparity_px for u in self.uncertainty], 4),
+            "sigma_yaw_deg": _rounded([np.degrees(u.yaw_rad) for u in self.uncertainty], 5),
+            "square_measured_mm": round(self.scale.square_mm, 4),
+            "length_ratio": None if self.scale.length_ratio is None else round(self.scale.length_ratio, 5),
+            "corner_noise_px": round(calibration.solution.sigma_px, 4),
+            "calibration_hash": self.rig.hash,
+        }
 
 
 def rig_model(calibration: Calibration, details: Mapping[str, Any] | None = None) -> RigModel:
@@ -22,3 +66,75 @@ def rig_model(calibration: Calibration, details: Mapping[str, Any] | None = None
         measures = {"rms_px": float(rms[index]), "sigma_length_m": sigma.length_m, "sigma_yaw_rad": sigma.yaw_rad}
         baselines.append(CalibratedBaseline.from_pose(float(nominal), T, **measures))
     return RigModel(cam0, cam1, tuple(baselines), "solved", details or {})
+
+
+def details(solved: Solved) -> dict[str, Any]:
+    """Return what the calibration file keeps for people and reports."""
+    calibration, board = solved.calibration, solved.calibration.observations.board
+    seen = coverage(calibration.observations)
+    left, right = camera_uncertainty(calibration)
+    return {
+        "board": {"board": board.label, "square_mm": board.square_m * 1e3},
+        "verdict": solved.verdict.text,
+        "retake": list(solved.verdict.retake),
+        "views": np.bincount(calibration.observations.baseline, minlength=len(calibration.nominal_m)).tolist(),
+        "corner_noise_px": calibration.solution.sigma_px,
+        "stray_corners": calibration.strays,
+        "outliers": [{"file": o.name, "rms_px": round(o.rms_px, 3)} for o in calibration.outliers],
+        "problems": list(solved.problems),
+        "sigma": {
+            "cam0": left,
+            "cam1": right,
+            "disparity_px": [u.disparity_px for u in solved.uncertainty],
+        },
+        "rail": _rail_rows(calibration),
+        "scale": {
+            "square_mm": solved.scale.square_mm,
+            "square_scatter_mm": solved.scale.square_scatter_mm,
+            "length_ratio": solved.scale.length_ratio,
+        },
+        "held_out": {
+            "median_px": solved.held_out.median_px,
+            "p95_px": solved.held_out.p95_px,
+            "median_by_baseline_px": _by_baseline(solved),
+            "median_by_cell_px": _by_cell(solved),
+        },
+        "leave_one_out": [_left_out_row(one) for one in solved.left_out],
+        "coverage": {"share": seen.share, "left": seen.left.tolist(), "right": seen.right.tolist()},
+    }
+
+
+def _rail_rows(calibration: Calibration) -> list[dict[str, Any]]:
+    if calibration.rail is None:
+        return []
+    return [{"component": c.name, "order": c.order, "scatter": c.scatter} for c in calibration.rail.components]
+
+
+def _by_baseline(solved: Solved) -> list[float | None]:
+    rows, baseline = np.abs(solved.held_out.row_px), solved.held_out.baseline
+    return [_median(rows[baseline == index]) for index in range(len(solved.calibration.nominal_m))]
+
+
+def _by_cell(solved: Solved) -> list[list[float | None]]:
+    rows = np.abs(solved.held_out.row_px)
+    column, row = cell_of(solved.held_out.left_px, solved.calibration.observations.size)
+    cells = range(CELLS[1]), range(CELLS[0])
+    return [[_median(rows[(row == r) & (column == c)]) for c in cells[1]] for r in cells[0]]
+
+
+def _median(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
+    return round(float(np.median(values)), 4) if len(values) else None
+
+
+def _left_out_row(one: LeftOutBaseline) -> dict[str, float]:
+    return {
+        "baseline_mm": round(one.baseline_mm, 4),
+        "epipolar_median_px": round(one.epipolar_median_px, 4),
+        "full_epipolar_median_px": round(one.full_epipolar_median_px, 4),
+        "baseline_error_mm": round(one.baseline_error_mm, 4),
+        "disparity_bias_px": round(one.disparity_bias_px, 4),
+    }
+
+
+def _rounded(values: Iterable[float], digits: int) -> list[float]:
+    return [round(float(value), digits) for value in values]

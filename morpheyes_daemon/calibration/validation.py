@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.projection import camera_from_vector
 from morpheyes_daemon.calibration.rectified import StereoGeometry, infinity_px, row_error_px
@@ -32,7 +33,7 @@ class HeldOut:
 
     row_px: Array
     left_px: Array
-    baseline: np.ndarray[tuple[int], np.dtype[np.intp]]
+    baseline: NDArray[np.intp]
 
     @property
     def median_px(self) -> float:
@@ -111,7 +112,7 @@ def _left_out(calibration: Calibration, index: int) -> LeftOutBaseline:
 
 
 def _row_errors(
-    calibration: Calibration, views: np.ndarray[tuple[int], np.dtype[np.bool_]], geometry: StereoGeometry
+    calibration: Calibration, views: NDArray[np.bool_], geometry: StereoGeometry
 ) -> tuple[Array, Array]:
     """Return the row error (n,) and left pixel (n, 2) of all corners that both eyes saw in the chosen views."""
     left = calibration.observations.left[views].reshape(-1, 2)
@@ -122,7 +123,7 @@ def _row_errors(
     return row[usable], left[seen][usable]
 
 
-def _folds(baseline: np.ndarray[tuple[int], np.dtype[np.intp]], count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+def _folds(baseline: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     """Deal the views of each baseline out to the folds in turn; the turn goes on from baseline to baseline."""
     fold = np.empty(len(baseline), dtype=np.intp)
     dealt = 0

@@ -1,0 +1,124 @@
+"""Which files of a folder belong together: one sub-folder per baseline, left and right by name and number.
+
+`100mm`, `122.2mm` and so on, or a folder of pictures alone for a fixed rig; side-by-side pictures are told by their
+shape. What cannot be used is named with a remedy and left out. No picture is searched for a board here.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+
+from morpheyes_daemon.errors import InputError
+
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
+_SIDE_BY_SIDE_ASPECT = 1.9
+"""Width over height from which a picture must hold both eyes."""
+
+
+@dataclass(frozen=True)
+class PairFiles:
+    """The files of one stereo picture; one path twice means side by side, None that this eye is missing."""
+
+    left: Path | None
+    right: Path | None
+
+    @property
+    def side_by_side(self) -> bool:
+        """Both eyes are in one file."""
+        return self.left is not None and self.left == self.right
+
+
+@dataclass(frozen=True)
+class BaselineFolder:
+    """The pictures taken at one baseline; `nominal_m` is None for a fixed rig whose folder names no length."""
+
+    nominal_m: float | None
+    folder: Path
+    pairs: tuple[PairFiles, ...]
+
+
+def read_folder(root: Path) -> tuple[list[BaselineFolder], list[str]]:
+    """Return the baseline folders under `root` in growing order, and a sentence on everything left out.
+
+    Raises InputError when there is nothing to calibrate from, or two folders claim the same baseline.
+    """
+    if not root.is_dir():
+        raise InputError(f"{root}: is not a folder; give the folder that holds the board pictures.")
+    named = [(length, path) for path in sorted(root.iterdir()) if (length := nominal_from_name(path)) is not None]
+    _refuse_duplicates(named)
+    problems: list[str] = []
+    if named:
+        folders = [_baseline_folder(path, length, problems) for length, path in sorted(named)]
+    else:
+        folders = [_baseline_folder(root, _length_m(root.name), problems)]
+    usable = [folder for folder in folders if folder.pairs]
+    if not usable:
+        raise InputError(
+            f"{root}: holds no left/right or side-by-side pictures; put them in one folder per baseline such as "
+            "100mm, named left01.png, right01.png and so on."
+        )
+    return usable, problems
+
+
+def nominal_from_name(path: Path) -> float | None:
+    """Return the baseline in metres that a folder's name tells, None when it is no such folder."""
+    return _length_m(path.name) if path.is_dir() else None
+
+
+def _length_m(name: str) -> float | None:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) ?mm", name.strip().lower())
+    return float(match[1]) / 1e3 if match and float(match[1]) > 0 else None
+
+
+def _refuse_duplicates(named: list[tuple[float, Path]]) -> None:
+    by_length: dict[int, Path] = {}
+    for length, path in named:
+        twin = by_length.setdefault(round(length * 1e5), path)
+        if twin != path:
+            raise InputError(
+                f"{path}: claims the same baseline as {twin.name}; keep one of them, or rename it to its own length."
+            )
+
+
+def _baseline_folder(folder: Path, nominal_m: float | None, problems: list[str]) -> BaselineFolder:
+    files = sorted(p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in IMAGE_SUFFIXES)
+    sided = [path for path in files if path.name.lower().startswith(("left", "right"))]
+    pairs = _left_right(sided, problems) if sided else _side_by_side(files)
+    if not pairs:
+        problems.append(f"{folder}: holds no stereo pictures; take them at this baseline, or remove the folder.")
+    elif all(pair.right is None for pair in pairs) or all(pair.left is None for pair in pairs):
+        eye = "right" if pairs[0].right is None else "left"
+        raise InputError(f"{folder}: has no {eye} picture at all; copy the {eye}*.png files there.")
+    return BaselineFolder(nominal_m, folder, tuple(pairs))
+
+
+def _left_right(files: list[Path], problems: list[str]) -> list[PairFiles]:
+    eyes: dict[str, dict[int, Path]] = {"left": {}, "right": {}}
+    for path in files:
+        eye = "left" if path.name.lower().startswith("left") else "right"
+        number = int(digits[-1]) if (digits := re.findall(r"\d+", path.stem)) else -1
+        if number in eyes[eye]:
+            problems.append(f"{path}: has the same number as {eyes[eye][number].name} and is left out; renumber it.")
+            continue
+        eyes[eye][number] = path
+    pairs = []
+    for number in sorted(eyes["left"].keys() | eyes["right"].keys()):
+        left, right = eyes["left"].get(number), eyes["right"].get(number)
+        if left is None or right is None:
+            alone, other = (left, "right") if right is None else (right, "left")
+            problems.append(f"{alone}: has no {other} picture of the same number; copy it there or retake the pair.")
+        pairs.append(PairFiles(left, right))
+    return pairs
+
+
+def _side_by_side(files: list[Path]) -> list[PairFiles]:
+    pairs = []
+    for path in files:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is not None and image.shape[1] >= _SIDE_BY_SIDE_ASPECT * image.shape[0]:
+            pairs.append(PairFiles(path, path))
+    return pairs

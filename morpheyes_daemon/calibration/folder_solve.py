@@ -1,0 +1,104 @@
+"""`calibrate solve` as a function: a folder of board pictures in, a calibration file and its figures out.
+
+What is wrong with the pictures is named, left out, and kept in the file; only what makes the result worthless
+raises. Corners found are remembered beside the result, so nothing is lost then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from morpheyes_daemon.calibration.boards import Board
+from morpheyes_daemon.calibration.detection import CornerCache, observe
+from morpheyes_daemon.calibration.folder import read_folder
+from morpheyes_daemon.calibration.plausibility import ScaleCheck, misnamed, scale_check
+from morpheyes_daemon.calibration.result import Solved, details, rig_model
+from morpheyes_daemon.calibration.solver import Calibration, calibrate
+from morpheyes_daemon.calibration.uncertainty import baseline_uncertainty
+from morpheyes_daemon.calibration.validation import held_out, leave_one_out
+from morpheyes_daemon.calibration.verdict import judge
+from morpheyes_daemon.calibration.views import Observations, Progress, silent
+from morpheyes_daemon.errors import CalibrationError
+
+CORNERS_SUFFIX = ".corners.npz"
+
+
+def solve_folder(
+    root: Path, board: Board, out: Path | None, progress: Progress = silent, header: Mapping[str, Any] | None = None
+) -> Solved:
+    """Solve the pictures under `root`; writes `out` when given. Raises InputError or CalibrationError.
+
+    `header` (date, name of the rig) is put first in the file's details.
+    """
+    folders, problems = read_folder(root)
+    cache = CornerCache(None if out is None else out.with_suffix(CORNERS_SUFFIX))
+    observations = observe(folders, board, cache, progress, problems)
+    solved = solve_observations(observations, progress, header)
+    if out is not None:
+        solved.rig.save(out)
+    return solved
+
+
+def solve_observations(
+    observations: Observations, progress: Progress = silent, header: Mapping[str, Any] | None = None
+) -> Solved:
+    """Solve, check and judge; raises CalibrationError when the two sizes a person gave cannot both be right."""
+    calibration, named = _without_misnamed(calibrate(observations, progress), progress)
+    problems = observations.problems + named
+    scale = scale_check(calibration)
+    _refuse_scale(scale, observations.board)
+    unseen = held_out(calibration, progress)
+    left_out = leave_one_out(calibration, progress)
+    uncertainty = [baseline_uncertainty(calibration, index) for index in range(len(calibration.nominal_m))]
+    verdict = judge(calibration, unseen, left_out, uncertainty, scale, problems)
+    rig = rig_model(calibration)
+    solved = Solved(calibration, unseen, left_out, uncertainty, scale, verdict, problems, rig)
+    return replace(solved, rig=replace(rig, details={**(header or {}), **details(solved)}))
+
+
+def read_board_file(root: Path) -> Mapping[str, Any]:
+    """Return what `board.yaml` in the folder says (board, square_mm, marker_mm, rig); empty without one."""
+    path = root / "board.yaml"
+    if not path.is_file():
+        return {}
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        content = None
+    if not isinstance(content, dict):
+        raise CalibrationError(f"{path}: cannot be read; write `board: 9x6` and `square_mm: 25` there, or delete it.")
+    return content
+
+
+def _without_misnamed(calibration: Calibration, progress: Progress) -> tuple[Calibration, tuple[str, ...]]:
+    """Solve again without baselines whose length contradicts the folder's name, naming them."""
+    observations = calibration.observations
+    wrong = misnamed(observations.nominal_m, calibration.lengths_m)
+    if not wrong:
+        return calibration, ()
+    named = tuple(
+        f"{observations.nominal_m[i] * 1e3:g}mm: its pictures were taken at {calibration.lengths_m[i] * 1e3:.1f} mm, "
+        "so it is left out; rename the folder or retake it."
+        for i in wrong
+    )
+    rest = [i for i in range(len(observations.nominal_m)) if i not in wrong]
+    if len(rest) < 2:
+        raise CalibrationError(f"Most folders are misnamed: {named[0]}")
+    kept = observations.at_baselines(rest)
+    again = calibrate(kept, progress)
+    return replace(again, outliers=calibration.outliers + again.outliers), named
+
+
+def _refuse_scale(scale: ScaleCheck, board: Board) -> None:
+    if scale.disagrees and scale.length_ratio is not None:
+        square_mm = board.square_m * 1e3
+        raise CalibrationError(
+            f"The squares of {square_mm:g} mm and the folders' names disagree: the solved baselines are "
+            f"{scale.length_ratio:.3f} of their names, as if a square were {square_mm / scale.length_ratio:.4g} mm; "
+            "measure several squares with a ruler and give --square-mm, or rename the folders."
+        )

@@ -1,0 +1,114 @@
+"""Fit to fly, or what to retake: the figures of a calibration turned into words a person can act on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from morpheyes_daemon.calibration.coverage import coverage, empty_corners
+from morpheyes_daemon.calibration.plausibility import ScaleCheck
+from morpheyes_daemon.calibration.solver import Calibration
+from morpheyes_daemon.calibration.uncertainty import BaselineUncertainty
+from morpheyes_daemon.calibration.validation import HeldOut, LeftOutBaseline
+
+HELD_OUT_GOOD_PX, HELD_OUT_LIMIT_PX = 0.5, 1.0
+"""Held-out row error, 95th percentile: factory rigs stay under the first; matching suffers from the second on."""
+_RMS_LIMIT_PX = 0.6
+_YAW_GOOD_PX = 0.25
+"""Disparity bias at infinity, one sigma: as large as the matcher's own noise."""
+_FEWEST_VIEWS = 8
+_LEAST_COVERAGE = 0.8
+_OUTLIER_SHARE = 0.25
+_LEFT_OUT_RATIO = 1.3
+_LEFT_OUT_FLOOR_PX = 0.05
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """`text` begins with "fit to fly", "fly with care" or "do not fly"; `retake` says what would make it better."""
+
+    text: str
+    retake: tuple[str, ...]
+
+
+def judge(
+    calibration: Calibration,
+    held_out: HeldOut,
+    left_out: list[LeftOutBaseline],
+    uncertainty: list[BaselineUncertainty],
+    scale: ScaleCheck,
+    problems: tuple[str, ...],
+) -> Verdict:
+    """Return the verdict on a calibration and everything its figures were made of."""
+    fatal = _fatal(calibration, held_out, scale)
+    advice = [*_views(calibration), *_cells(calibration), *_yaw(calibration, uncertainty), *_rail(left_out)]
+    retake = tuple(fatal + advice)
+    if fatal:
+        return Verdict(f"do not fly: {fatal[0]}", retake)
+    if held_out.p95_px > HELD_OUT_GOOD_PX:
+        return Verdict(f"fly with care: rows of held-out boards differ by {held_out.p95_px:.2f} px (95 %)", retake)
+    if advice or problems:
+        return Verdict(f"fly with care: {(advice + list(problems))[0]}", retake)
+    return Verdict(f"fit to fly: rows of held-out boards agree within {held_out.p95_px:.2f} px (95 %)", retake)
+
+
+def _fatal(calibration: Calibration, held_out: HeldOut, scale: ScaleCheck) -> list[str]:
+    found = []
+    if scale.disagrees and scale.length_ratio is not None:
+        found.append(
+            f"the solved baselines are {scale.length_ratio:.3f} of their names: measure a square and the baselines"
+        )
+    if held_out.p95_px > HELD_OUT_LIMIT_PX:
+        found.append(f"rows of held-out boards differ by {held_out.p95_px:.2f} px (95 %): retake it, board still")
+    for nominal, rms in zip(calibration.nominal_m, calibration.rms_px, strict=True):
+        if rms > _RMS_LIMIT_PX:
+            found.append(f"{nominal * 1e3:g} mm fits only to {rms:.2f} px: retake it, board and rig held still")
+    return found
+
+
+def _views(calibration: Calibration) -> list[str]:
+    observations = calibration.observations
+    advice = []
+    for index, nominal in enumerate(calibration.nominal_m):
+        chosen = observations.baseline == index
+        both = np.isfinite(observations.left[chosen, :, 0]).any(axis=1) & np.isfinite(
+            observations.right[chosen, :, 0]
+        ).any(axis=1)
+        if np.count_nonzero(both) < _FEWEST_VIEWS:
+            advice.append(f"{nominal * 1e3:g} mm has only {np.count_nonzero(both)} usable pairs: take at least ten")
+    dropped = Counter(outlier.name.split("/")[0] for outlier in calibration.outliers if "/" in outlier.name)
+    for folder, count in dropped.items():
+        if count > _OUTLIER_SHARE * 2 * _FEWEST_VIEWS:
+            advice.append(f"{folder} has {count} outlier pictures: retake it without moving")
+    return advice
+
+
+def _cells(calibration: Calibration) -> list[str]:
+    seen = coverage(calibration.observations)
+    advice = []
+    for eye, counts in (("left", seen.left), ("right", seen.right)):
+        empty = empty_corners(counts)
+        if empty or np.mean(counts > 0) < _LEAST_COVERAGE:
+            where = " and ".join(empty) or "border"
+            advice.append(
+                f"boards cover {np.mean(counts > 0):.0%} of the {eye} image: show one in the {where} of the picture"
+            )
+    return advice
+
+
+def _yaw(calibration: Calibration, uncertainty: list[BaselineUncertainty]) -> list[str]:
+    return [
+        f"the yaw at {nominal * 1e3:g} mm is known to {sigma.disparity_px:.2f} px only: add far and near boards there"
+        for nominal, sigma in zip(calibration.nominal_m, uncertainty, strict=True)
+        if sigma.disparity_px > _YAW_GOOD_PX
+    ]
+
+
+def _rail(left_out: list[LeftOutBaseline]) -> list[str]:
+    return [
+        f"{one.baseline_mm:g} mm is not what its neighbours predict: take it and baselines beside it again"
+        for one in left_out
+        if one.epipolar_median_px > _LEFT_OUT_RATIO * one.full_epipolar_median_px + _LEFT_OUT_FLOOR_PX
+    ]

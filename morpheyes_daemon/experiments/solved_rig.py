@@ -1,0 +1,56 @@
+"""The calibration file that simulated flights use: solved from boards of the same twin rig, made once and kept."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from morpheyes_daemon.calibration.result import rig_model
+from morpheyes_daemon.calibration.solver import calibrate
+from morpheyes_daemon.calibration.views import Progress, silent
+from morpheyes_daemon.errors import CalibrationError
+from morpheyes_daemon.experiments.rendered_boards import DEFAULT_BOARD, observe_twin, twin_name
+from morpheyes_daemon.stereo.rig import RigModel
+
+_SIZE = (640, 480)
+_VIEWS = 8
+_METHOD = 1
+"""Raised whenever boards, detection or solver change, so that files made before are not used again."""
+
+
+def solved_rig_file(seed: int, cache_dir: Path | None = None, progress: Progress = silent) -> Path:
+    """Return a calibration file of the twin rig of `seed` at 640x480, solved on the first call and kept.
+
+    The rig model serves other sizes of the same shape. A file that is damaged is made again.
+    """
+    folder = default_cache() if cache_dir is None else cache_dir
+    path = folder / f"{twin_name(seed, _SIZE)}-v{_METHOD}.yaml"
+    if not _readable(path):
+        solve_twin(seed, progress).save(path)
+    return path
+
+
+def solve_twin(seed: int, progress: Progress = silent) -> RigModel:
+    """Render boards before the twin rig of `seed`, find their corners and solve."""
+    observations = observe_twin(seed, views=_VIEWS, board=DEFAULT_BOARD, size=_SIZE, progress=progress)
+    details = {
+        "rig": twin_name(seed, _SIZE),
+        "board": {"board": DEFAULT_BOARD.label, "square_mm": DEFAULT_BOARD.square_m * 1e3},
+    }
+    return rig_model(calibrate(observations, progress), details)
+
+
+def default_cache() -> Path:
+    """Return the folder for such files in the user's cache (XDG_CACHE_HOME)."""
+    root = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(root) / "morpheyes" / "calibration"
+
+
+def _readable(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    try:
+        RigModel.load(path)
+    except CalibrationError:
+        return False
+    return True
