@@ -32,7 +32,7 @@ EXTRINSIC = ("T", "phi", "theta", "psi")
 """The columns of table I. T is T_x; phi, theta, psi turn about x, y, z of the right eye."""
 
 NOMINAL: Mapping[str, float] = {"alpha": 1e-3, "k1": -0.1, "k2": 0.02, "k3": 1e-3, "k4": 1e-3, "k5": 5e-3}
-"""What errors are percent of; the paper does not say. They are proportional to it, their ratios do not depend on it."""
+"""What errors are percent of, since the paper does not say; table I does not depend on it."""
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5")
 
@@ -164,5 +164,5 @@ def _largest(offset_px: Array) -> PixelError:
 
 
 def _ratio(numerator: float, denominator: float) -> float:
-    """Return the ratio, to twelve digits so that rounding in the last bit does not show."""
-    return round(numerator / denominator, 12)
+    """Return the ratio, to nine digits so that rounding in the last bits does not show."""
+    return round(numerator / denominator, 9)
