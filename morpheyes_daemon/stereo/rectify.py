@@ -30,9 +30,6 @@ CACHED = 8
 """Rectifications kept; one at 640x480 takes 5 MB."""
 
 
-_NO_MAP: FloatMap = np.empty(0, dtype=np.float32)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class RectifiedEye:
     """How one eye's raw image becomes the rectified one.
@@ -49,8 +46,9 @@ class RectifiedEye:
 
     def image(self, raw: Image) -> Image:
         """Return the rectified image (H, W) or (H, W, 3) of a raw one."""
+        # the second map must be None: OpenCV 5 makes rubbish of an empty array there
         return np.asarray(
-            cv2.remap(raw, self.map_px, _NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
+            cv2.remap(raw, self.map_px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
         )
 
     def points(self, uv: Array) -> Array:
@@ -206,4 +204,4 @@ def _spread(coarse: FloatMap, pinhole: Pinhole) -> FloatMap:
     step = grid_step(pinhole.width)
     rows, columns = coarse.shape[:2]
     fine = cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(fine[step : step + pinhole.height, step : step + pinhole.width])
+    return np.ascontiguousarray(fine[step : step + pinhole.height, step : step + pinhole.width])
