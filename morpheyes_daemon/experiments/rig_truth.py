@@ -8,12 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from morpheyes_daemon.calibration.boards import Board
+from morpheyes_daemon.calibration.detection import observe
+from morpheyes_daemon.calibration.folder import read_folder
 from morpheyes_daemon.calibration.rectified import StereoGeometry, image_grid, infinity_px, row_error_px
+from morpheyes_daemon.calibration.result import rig_model
+from morpheyes_daemon.calibration.solver import solve_separately
+from morpheyes_daemon.calibration.views import Progress, silent
 from morpheyes_daemon.errors import CalibrationError
+from morpheyes_daemon.experiments.rendered_boards import twin_from_name
 from morpheyes_daemon.simulation.rig_twin import RANGE_M, RigTwin
 from morpheyes_daemon.stereo.rectify import homogeneous
 from morpheyes_daemon.stereo.rig import RigModel
@@ -102,3 +110,32 @@ def true_projections(true: StereoGeometry) -> tuple[Array, Array]:
         lefts.append(left[inside])
         rights.append(right[inside])
     return np.concatenate(lefts), np.concatenate(rights)
+
+
+def twin_of(rig: RigModel, seed: int | None, file: Path) -> RigTwin:
+    """Return the twin that `rig` was solved from: of the given seed, or the one its file names."""
+    if seed is not None:
+        return RigTwin(*rig.size, seed=seed)
+    twin = twin_from_name(str(rig.details.get("rig", "")))
+    if twin is None:
+        raise CalibrationError(f"{file}: was not solved from a twin's boards; name the twin with --seed.")
+    return twin
+
+
+def compare_separate(
+    folder: Path, board: Board, rig: RigModel, twin: RigTwin, progress: Progress = silent
+) -> dict[str, dict[str, float]]:
+    """Return the figures at the calibrated baselines only, of the joint solve and of one solve for each baseline."""
+    folders, problems = read_folder(folder)
+    observations = observe(folders, board, None, progress, problems)
+    separate = [evaluate_rig(rig_model(one), twin, one.nominal_m.tolist()) for one in solve_separately(observations)]
+    joint = evaluate_rig(rig, twin, observations.nominal_m.tolist())
+    return {
+        "joint": joint.figures(),
+        "separate": {
+            "epipolar_median_px": round(float(np.median([one.epipolar_median_px for one in separate])), 4),
+            "epipolar_p95_px": round(float(np.percentile([one.epipolar_p95_px for one in separate], 95)), 4),
+            "baseline_error_max_mm": round(max(one.baseline_error_max_mm for one in separate), 4),
+            "disparity_bias_max_px": round(max(one.disparity_bias_max_px for one in separate), 4),
+        },
+    }

@@ -1,0 +1,129 @@
+"""The simulated side of a flight: world, vehicle and autopilot, Teensy, cameras and ground crew, put together.
+
+Everything the daemon must not know lives here. The same stage serves lockstep (in-memory links, virtual clock) and
+real time (sockets and a pty, in a process of its own).
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass, replace
+
+from morpheyes_daemon.clock import MS, Clock, S
+from morpheyes_daemon.config import NoServoConfig, VehicleConfig
+from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
+from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
+from morpheyes_daemon.simulation.collision import VehicleShape
+from morpheyes_daemon.simulation.renderer import Renderer
+from morpheyes_daemon.simulation.rig_twin import RigTwin
+from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
+from morpheyes_daemon.simulation.vehicle import Truth, Vehicle
+from morpheyes_daemon.simulation.wind import WindConditions
+from morpheyes_daemon.simulation.worlds import World, build_world, load_world
+from morpheyes_daemon.transforms import Array
+
+READOUT_NS = 10 * MS
+"""From mid-exposure of the later eye to the daemon having the pair."""
+
+WIND_M_S = 2.0
+"""Mean wind at 6 m height of the default flight: a light breeze, with its gusts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What differs between simulated flights; everything random comes from `seed`.
+
+    `rig_seed` is the rig that was calibrated; it does not change from flight to flight.
+    """
+
+    world: str
+    seed: int
+    rig_seed: int = 0
+    wind_m_s: float = WIND_M_S
+    sensor: Sensor = Sensor()
+
+
+class Stage:
+    """One simulated flight's truth."""
+
+    def __init__(self, scenario: Scenario, config: VehicleConfig, clock: Clock, render_threads: int = 1) -> None:
+        seed = scenario.seed
+        self.clock = clock
+        self.world: World = build_world(load_world(scenario.world), seed)
+        wind = WindConditions(scenario.wind_m_s, random.Random(f"wind from {seed}").uniform(-math.pi, math.pi))
+        north, east, _ = self.world.start_ned_m
+        self.autopilot = AutopilotTwin(Vehicle(wind=wind, seed=seed, start_ned_m=(north, east)), clock, seed=seed)
+        self.radio = self.autopilot.radio
+        self.teensy = TeensyTwin(_servo_truth(config), clock, seed)
+        self._fixed_m = config.servo.baseline_mm / 1e3 if isinstance(config.servo, NoServoConfig) else None
+        self.rig = RigTwin(config.camera.width_px, config.camera.height_px, scenario.rig_seed)
+        sensor = replace(scenario.sensor, sync_offset_s=config.camera.sync_error_ms / 1e3)
+        self._epoch_ns = clock.now_ns()
+        self.camera = CameraTwin(
+            Renderer(self.world.scene), self.rig, config.camera.mount, sensor, seed, self._epoch_ns, render_threads
+        )
+        self._shape = VehicleShape(config.footprint, config.camera.mount)
+
+    def baseline_m(self, t_ns: int) -> float:
+        """True distance between the eyes."""
+        return self.rig.actual_m(self._fixed_m or self.teensy.baseline_at(t_ns))
+
+    def truth(self, t_ns: int) -> Truth:
+        """Where the vehicle really was."""
+        return self.autopilot.truth_at(t_ns)
+
+    def clearance_m(self, t_ns: int) -> float:
+        """Distance from hull and bar to the nearest obstacle, ground aside; negative is a collision."""
+        truth = self.truth(t_ns)
+        T = truth.T_ned_frd
+        t_s = (t_ns - self._epoch_ns) / S
+        return self.world.clearance_m(T[:3, 3], T[:3, :3], self._shape, self.baseline_m(t_ns), t_s)
+
+    def expose(self, seq: int, t_ns: int) -> RawPair:
+        """Take a stereo pair at `t_ns`, which must lie a sync offset in the past."""
+        return self.camera.render_pair(t_ns, seq, self._pose_at, self.baseline_m(t_ns))
+
+    @property
+    def delivery_ns(self) -> int:
+        """From mid-exposure of the left eye to the pair being there."""
+        return round(self.camera.sensor.sync_offset_s * S) + READOUT_NS
+
+    def close(self) -> None:
+        """End the render threads."""
+        self.camera.close()
+
+    def _pose_at(self, t_ns: int) -> Array:
+        return self.truth(t_ns).T_ned_frd
+
+
+class StageCamera:
+    """The `sim` camera of a daemon on the same loop: exposures on a grid, delivered a little later."""
+
+    def __init__(self, stage: Stage, rate_hz: float) -> None:
+        self._stage = stage
+        self._period_ns = round(S / rate_hz)
+        self._seq = 0
+        self._next_ns = 0
+
+    async def open(self) -> None:
+        """Start the grid of exposures."""
+        self._next_ns = self._stage.clock.now_ns() + self._period_ns
+
+    async def read(self) -> RawPair:
+        """Wait for the next exposure; those missed meanwhile are skipped."""
+        clock = self._stage.clock
+        exposed_ns = self._next_ns
+        await clock.sleep_until_ns(exposed_ns + self._stage.delivery_ns)
+        late = max(0, clock.now_ns() - exposed_ns - self._stage.delivery_ns) // self._period_ns
+        self._next_ns += self._period_ns * (1 + late)
+        self._seq += 1 + late
+        return self._stage.expose(self._seq, exposed_ns + late * self._period_ns)
+
+    async def close(self) -> None:
+        """Nothing to close."""
+
+
+def _servo_truth(config: VehicleConfig) -> ServoTruth:
+    return ServoTruth() if isinstance(config.servo, NoServoConfig) else ServoTruth.from_config(config.servo.motion)
