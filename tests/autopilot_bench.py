@@ -123,9 +123,9 @@ class AutopilotBench:
 
     def take_off(self, height_m: float = 3.0) -> None:
         """Arm and climb in Loiter by overrides, and centre the receiver's sticks."""
+        self.hold(1.5, 1500, 1500, 1000, 1500)
         if self.twin.parameters.flow_only:
             self.station.send(mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0))
-        self.hold(3.5, 1500, 1500, 1000, 1500)
         assert self.station.command(mavlink.MAV_CMD_DO_SET_MODE, 1, Mode.LOITER) == 0, self.texts
         assert self.station.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == 0, self.texts
         self.radio.sticks()

@@ -206,6 +206,8 @@ class Autopilot:
             return "Radio failsafe on"
         if self._ekf_failed or (self.mode.needs_position and not self.estimator.has_position):
             return "Need Position Estimate"
+        if not self.estimator.has_origin:
+            return "AHRS: waiting for home"
         if self.table["FS_THR_ENABLE"] != 0:
             if not self.rc.ever_seen:
                 return "RC not found"

@@ -50,7 +50,6 @@ _AIDING_TIMEOUT_NS = round(0.9 * S)
 _DEAD_RECKONING_NS = 5 * S
 """How long velocity and position go on to be reported after the aiding is lost."""
 
-_FLOW_START_NS = 2 * S
 _UNAIDED_M_S_SQRT_S = 0.1
 """How fast the velocity estimate walks away without aiding."""
 
@@ -110,7 +109,7 @@ class Estimator:
         self.drift_m = [0.0, 0.0, 0.0]
         self._boot_ns = 0
         self._ready_after_ns = round(ready_after_s * S)
-        self._origin_ns: int | None = None
+        self._origin_set = False
         self._aiding_lost_ns: int | None = None
         self._unaided_m_s = [0.0, 0.0]
         self.variance = 0.05
@@ -119,19 +118,23 @@ class Estimator:
     def boot(self, t_ns: int) -> None:
         """Start over: no origin, not ready."""
         self._boot_ns = self._t_ns = t_ns
-        self._origin_ns = None
+        self._origin_set = False
 
     def set_origin(self) -> bool:
-        """Set the EKF origin; returns False when there is one already."""
+        """Set the EKF origin; returns False when there is one already.
+
+        Before the EKF is aiding it is taken and then lost, as on the real one.
+        """
         if self.has_origin:
             return False
-        self._origin_ns = self._t_ns
+        if self._started():
+            self._origin_set = True
         return True
 
     @property
     def has_origin(self) -> bool:
         """The EKF knows where on Earth it is."""
-        return self._origin_ns is not None or (not self._table.flow_only and self._warm())
+        return self._origin_set or (not self._table.flow_only and self._warm())
 
     def lose_aiding(self) -> None:
         """The flow sensor (or GPS) stops delivering."""
@@ -150,10 +153,7 @@ class Estimator:
 
     def _started(self) -> bool:
         """The EKF has once been given all it needs."""
-        if not self._table.flow_only:
-            return self._warm()
-        waited = self._origin_ns is not None and self._t_ns - self._origin_ns >= _FLOW_START_NS
-        return self._warm() and waited and self._table["RNGFND1_TYPE"] != 0
+        return self._warm() and not (self._table.flow_only and self._table["RNGFND1_TYPE"] == 0)
 
     @property
     def flags(self) -> Ekf:

@@ -64,6 +64,7 @@ class FlightControl:
         self._takeoff_m: float | None = None
         self._phase = Phase.CLIMB
         self._phase_s = 0.0
+        self._leaning: tuple[PilotInput | None, float, tuple[float, float]] = None, 0.0, (0.0, 0.0)
         self._wait_s = 0.0
         self._blind = False
 
@@ -211,7 +212,7 @@ class FlightControl:
     def _horizontal(self, pilot: PilotInput) -> tuple[float, float]:
         """Return the lean, forward and right."""
         if self.mode in (Mode.STABILIZE, Mode.ALT_HOLD):
-            return _lean(pilot, self.settings.angle_rad)
+            return self._stick_lean(pilot, self.settings.angle_rad)
         if not self.dead_reckons or (self._blind and self.mode is Mode.LAND):
             return 0.0, 0.0
         heading = math.cos(self._vehicle.yaw_rad), math.sin(self._vehicle.yaw_rad)
@@ -219,9 +220,9 @@ class FlightControl:
 
     def _reference(self, pilot: PilotInput, heading: tuple[float, float]) -> Reference:
         if self.mode is Mode.LOITER:
-            forward, right = _lean(pilot, self.settings.loiter.angle_rad)
-            law, limit = self.settings.loiter, self.speed_limit_m_s
-            self._loiter.step(law, limit, forward, right, heading, STEP_S)
+            law = self.settings.loiter
+            lean = self._stick_lean(pilot, law.angle_rad)
+            self._loiter.step(law, self.speed_limit_m_s, *lean, heading, STEP_S)
             return self._loiter
         assert self._moving is not None
         if self.mode is Mode.RTL and self._phase is not Phase.CLIMB:
@@ -229,6 +230,12 @@ class FlightControl:
         else:
             self._moving.step(0.0, 0.0, STEP_S)
         return self._moving
+
+    def _stick_lean(self, pilot: PilotInput, angle_rad: float) -> tuple[float, float]:
+        """Return `_lean`, worked out again only when the sticks moved."""
+        if pilot is not self._leaning[0] or angle_rad != self._leaning[1]:
+            self._leaning = pilot, angle_rad, _lean(pilot, angle_rad)
+        return self._leaning[2]
 
     @property
     def speed_limit_m_s(self) -> float:

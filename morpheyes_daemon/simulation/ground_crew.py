@@ -2,7 +2,8 @@
 
 `GroundCrew` gets the vehicle into the air in Loiter and hands it over by the engage switch, as a person would: it
 hears telemetry over its own link, moves the radio's sticks, and sends a ground station's heartbeat and commands. It
-never sends overrides. The daemon's flight service does none of this.
+never sends overrides, and runs in lockstep as well as in real time. `mavsdk_crew` does the same through mavsdk. The
+daemon's flight service does none of this.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from morpheyes_daemon.simulation.radio import Radio
 GROUND_STATION = (255, 190)
 """System and component id of a usual ground station."""
 
+ORIGIN = (-353632620, 1491652370, 584000)
+"""Latitude and longitude (1e-7 degrees) and altitude (mm) given to an EKF without GPS; only their being set counts."""
+
 _CLIMB_US, _EASE_US, _SINK_US, _IDLE_US, _MIDDLE_US = 1750, 1640, 1360, 1000, 1500
 _EASE_BELOW_M = 0.7
 _PERIOD_NS = 50 * MS
@@ -35,8 +39,11 @@ _STREAMS_HZ = {
 class GroundCrew:
     """A pilot's hands on `radio` and a ground station on `link`; hand received bytes to `on_bytes`."""
 
-    def __init__(self, radio: Radio, link: ByteLink, clock: Clock, vehicle_sysid: int = 1) -> None:
+    def __init__(
+        self, radio: Radio, link: ByteLink, clock: Clock, *, without_gps: bool = False, vehicle_sysid: int = 1
+    ) -> None:
         self._radio, self._link, self._clock = radio, link, clock
+        self._without_gps = without_gps
         self._target = vehicle_sysid, 1
         self._mav = mavlink.MAVLink(None, *GROUND_STATION)
         self._mav.robust_parsing = True
@@ -65,9 +72,8 @@ class GroundCrew:
         Raises DeviceTimeoutError when the autopilot does not get ready, arm or climb, with its last words.
         """
         self._ask_for_streams()
-        self._command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, Mode.LOITER)
         self._radio.sticks(throttle_us=_IDLE_US)
-        await self._until(self._ready, 60.0, "get ready to arm", self._request_loiter)
+        await self._until(self._ready, 60.0, "get ready to arm", self._prepare)
         await self._until(self._armed, 10.0, "arm", self._request_arming)
         self._radio.sticks(throttle_us=_CLIMB_US)
         await self._until(lambda: self._height_m() > height_m - _EASE_BELOW_M, 60.0, "climb")
@@ -95,7 +101,11 @@ class GroundCrew:
         for message_id, rate_hz in _STREAMS_HZ.items():
             self._command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, round(1e6 / rate_hz))
 
-    def _request_loiter(self) -> None:
+    def _prepare(self) -> None:
+        """Ask for Loiter, and without GPS give the EKF its origin once it is aiding."""
+        report = self.latest.get("EKF_STATUS_REPORT")
+        if self._without_gps and report is not None and report.flags & mavlink.EKF_POS_HORIZ_REL:
+            self._send(mavlink.MAVLink_set_gps_global_origin_message(self._target[0], *ORIGIN))
         if not self._in_loiter():
             self._command(mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, Mode.LOITER)
 
@@ -104,7 +114,7 @@ class GroundCrew:
 
     def _in_loiter(self) -> bool:
         heartbeat = self.latest.get("HEARTBEAT")
-        return heartbeat is not None and int(heartbeat.custom_mode) == Mode.LOITER
+        return heartbeat is not None and bool(heartbeat.custom_mode == Mode.LOITER)
 
     def _ready(self) -> bool:
         status = self.latest.get("SYS_STATUS")

@@ -87,6 +87,8 @@ class RcInput:
         self._updated_ns: int | None = None
         self._had_receiver = False
         self._bad_frames = 0
+        self._pilot: PilotInput | None = None
+        self._pilot_made_of: tuple[bool, int, tuple[int, ...]] | None = None
         self._switch = -1
         self._switch_candidate = -1
         self._switch_since_ns = 0
@@ -185,8 +187,14 @@ class RcInput:
         return self.channels_us[int(self._table[f"RCMAP_{stick}"]) - 1]
 
     def pilot(self) -> PilotInput:
-        """Return the sticks as the flight modes see them."""
+        """Return the sticks as the flight modes see them; the same object while nothing changes."""
         valid = self.ever_seen and not self.failsafe and self._bad_frames == 0
+        made_of = valid, self._table.version, tuple(self.channels_us)
+        if self._pilot is None or made_of != self._pilot_made_of:
+            self._pilot, self._pilot_made_of = self._calibrated(valid=valid), made_of
+        return self._pilot
+
+    def _calibrated(self, *, valid: bool) -> PilotInput:
         if not valid:
             return PilotInput(0.0, 0.0, 0.0, 0.0, self._throttle(self._middle_us()), False)
         return PilotInput(

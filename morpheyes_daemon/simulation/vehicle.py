@@ -27,6 +27,7 @@ AHEAD_NS = 50_000_000
 """How far past the newest step the truth may be extrapolated."""
 
 _STEPS_PER_GUST = 4
+_STEPS_PER_SHIVER = 2
 _THRUST_LAG_S = 0.05
 _YAW_LAG_S = 0.1
 _SHIVER_TAU_S = 0.03
@@ -108,7 +109,7 @@ class Vehicle:
         self._accel_up = 0.0
         self._shiver = [0.0, 0.0, 0.0]
         self._random = random.Random(f"vehicle {seed}")
-        self._keep = math.exp(-STEP_S / _SHIVER_TAU_S)
+        self._keep = math.exp(-_STEPS_PER_SHIVER * STEP_S / _SHIVER_TAU_S)
         self._kick = self.airframe.shiver_rad * math.sqrt(1.0 - self._keep**2)
         self._count = 0
         self._history: deque[_Row] = deque(maxlen=round(HISTORY_S / STEP_S))
@@ -162,8 +163,12 @@ class Vehicle:
 
     def _turn(self) -> None:
         wanted = self.controls.yaw_rate_rad_s if self.controls.motors else 0.0
+        if self._count % _STEPS_PER_SHIVER == 0:
+            self._shake()
         self.yaw_rate_rad_s += (wanted - self.yaw_rate_rad_s) * STEP_S / _YAW_LAG_S
         self.yaw_rad = wrap_rad(self.yaw_rad + self.yaw_rate_rad_s * STEP_S)
+
+    def _shake(self) -> None:
         gauss, shiver = self._random.gauss, self._shiver
         for axis in (0, 1, 2):
             shiver[axis] = self._keep * shiver[axis] + self._kick * gauss()

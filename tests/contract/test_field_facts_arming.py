@@ -26,6 +26,10 @@ def ekf_flags(bench: AutopilotBench) -> int:
     return int(bench.station.heard["EKF_STATUS_REPORT"][-1].flags)
 
 
+def set_origin(bench: AutopilotBench) -> None:
+    bench.station.send(mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0))
+
+
 # Arming
 
 
@@ -116,19 +120,30 @@ def test_with_gps_a_position_comes_42_seconds_after_boot() -> None:
 def test_with_flow_the_origin_must_be_set_once_per_boot() -> None:
     bench = AutopilotBench(dict(FLOW_SETUP))
     for _ in range(2):
-        bench.wait(10.0)
-        assert not ekf_flags(bench) & Ekf.POS_HORIZ_REL
-        assert ekf_flags(bench) & Ekf.CONST_POS_MODE
-        bench.station.send(mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0))
         bench.wait(3.0)
         assert ekf_flags(bench) & Ekf.POS_HORIZ_REL
         assert not ekf_flags(bench) & Ekf.CONST_POS_MODE
+        assert bench.twin.set_mode(Mode.LOITER)
+        assert bench.station.command(ARM, 1) == FAILED
+        assert bench.texts[-1] == "Arm: AHRS: waiting for home"
+        set_origin(bench)
+        bench.wait(1.0)
+        assert bench.station.command(ARM, 1) == ACCEPTED
+        assert bench.station.command(ARM, 0) == ACCEPTED
         assert bench.station.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == ACCEPTED
+
+
+def test_an_origin_that_comes_before_the_ekf_is_aiding_is_lost() -> None:
+    bench = AutopilotBench(dict(FLOW_SETUP), ready_after_s=5.0)
+    bench.wait(1.0)
+    set_origin(bench)
+    bench.wait(9.0)
+    bench.twin.set_mode(Mode.LOITER)
+    assert bench.station.command(ARM, 1) == FAILED
 
 
 def test_flow_needs_a_rangefinder() -> None:
     bench = AutopilotBench({**FLOW_SETUP, "RNGFND1_TYPE": 0})
-    bench.station.send(mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0))
     bench.wait(10.0)
     assert ekf_flags(bench) & Ekf.CONST_POS_MODE
 

@@ -128,7 +128,7 @@ def test_an_override_of_the_mode_channel_changes_the_mode_and_its_release_drops_
     for _ in range(25):
         bench.station.override(*NEUTRAL, 0)
         bench.wait(0.02)
-    assert bench.mode is Mode.STABILIZE
+    assert bench.twin.autopilot.mode is Mode.STABILIZE
     assert not bench.truth.height_m < 1.0
 
 
@@ -144,7 +144,7 @@ def test_a_neutral_throttle_override_in_stabilize_is_hover_thrust_against_the_pi
     bench.radio.sticks(throttle_us=1000)
     bench.radio.mode_switch(4)
     bench.hold(1.5, *NEUTRAL)
-    assert bench.mode is Mode.STABILIZE
+    assert bench.twin.autopilot.mode is Mode.STABILIZE
     assert abs(bench.truth.v_ned_m_s[2]) < 0.3, "the pilot's throttle was low"
 
 
@@ -284,4 +284,4 @@ def test_the_transmitters_loss_is_hidden_by_overrides_too() -> None:
     bench.hold(5.0, *NEUTRAL)
     assert bench.mode is Mode.LOITER
     bench.wait(1.5)
-    assert bench.mode is Mode.LAND
+    assert bench.twin.autopilot.mode is Mode.LAND
