@@ -21,7 +21,6 @@ from morpheyes_daemon.stereo.matching import Match, MatchSettings, disparity_ran
 from morpheyes_daemon.stereo.rectify import Rectification, Rectifier
 from morpheyes_daemon.stereo.rig import RigModel
 
-
 TALL_PX = 400
 """Image height from which every second row is enough: 640x480 so matched is still better than 320x240 in full."""
 

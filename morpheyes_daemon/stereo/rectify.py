@@ -48,7 +48,10 @@ class RectifiedEye:
         """Return the rectified image (H, W) or (H, W, 3) of a raw one."""
         # the second map must be None: OpenCV 5 makes rubbish of an empty array there
         return np.asarray(
-            cv2.remap(raw, self.map_px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
+            cv2.remap(  # type: ignore[call-overload]
+                raw, self.map_px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            ),
+            np.uint8,
         )
 
     def points(self, uv: Array) -> Array:

@@ -1,0 +1,121 @@
+"""Depth of a single pair of pictures, taken by any camera: rectified ones with f and b, or raw ones with a rig.
+
+The flying pipeline is `depth.DepthEstimator`, which this uses for raw pictures.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from morpheyes_daemon.errors import CalibrationError, InputError
+from morpheyes_daemon.messages import BaselineEstimate, FloatMap, Image, StereoFrame
+from morpheyes_daemon.stereo.depth import DepthEstimator, depth_from_disparity, grey, near_limit_m
+from morpheyes_daemon.stereo.matching import MatchSettings, disparity_range, match
+from morpheyes_daemon.stereo.rig import RigModel
+
+SEARCHED_SHARE = 0.25
+"""Share of the image width that is searched when nobody says how near to look."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StillDepth:
+    """depth_m (H, W) float32 metres of the (rectified) left picture, NaN unknown; masks as in `messages.DepthMap`."""
+
+    left: Image
+    depth_m: FloatMap
+    near: NDArray[np.bool_]
+    one_eyed: NDArray[np.bool_]
+    near_limit_m: float
+    baseline_m: float
+    f_px: float
+
+    @property
+    def valid_fraction(self) -> float:
+        """Share of the pixels that have a depth."""
+        return float(np.isfinite(self.depth_m).mean())
+
+    @property
+    def ceiling_fraction(self) -> float:
+        """Share of the pixels that are nearer than `near_limit_m`."""
+        return float(self.near.mean())
+
+    @property
+    def median_depth_m(self) -> float | None:
+        """Median of the known depths, None when none is."""
+        known = self.depth_m[np.isfinite(self.depth_m)]
+        return float(np.median(known)) if known.size else None
+
+
+def rectified_depth(
+    left: Image, right: Image, *, f_px: float, baseline_m: float, doffs_px: float = 0.0, near_m: float | None = None
+) -> StillDepth:
+    """Return the depth of an already rectified pair: Z = b f / (d + doffs).
+
+    `near_m` is the nearest depth to look for. Raises InputError when the sizes differ or `near_m` needs more
+    disparities than the pictures are wide.
+    """
+    require_same_size(left, right)
+    width = left.shape[1]
+    low = math.floor(-doffs_px)
+    if near_m is None:
+        count = disparity_range(SEARCHED_SHARE * width - 1, width)
+    else:
+        largest = f_px * baseline_m / near_m - doffs_px - low
+        count = disparity_range(largest, width)
+        if count <= largest:
+            nearest = near_limit_m(baseline_m, f_px, low + count, doffs_px)
+            raise InputError(
+                f"Pictures {width} px wide at this baseline show nothing nearer than {nearest:.2f} m; "
+                f"ask for no less with --near-m."
+            )
+    found = match(grey(left), grey(right), count, MatchSettings(), min_disparity=low)
+    depth_m = depth_from_disparity(found.disparity_px, baseline_m, f_px, doffs_px)
+    limit = near_limit_m(baseline_m, f_px, found.ceiling_px, doffs_px)
+    return StillDepth(left, depth_m, found.near, found.one_eyed, limit, baseline_m, f_px)
+
+
+def raw_depth(
+    left: Image, right: Image, rig: RigModel, baseline_m: float | None = None, near_m: float | None = None
+) -> StillDepth:
+    """Return the depth of a raw pair of a calibrated rig, in its rectified left picture.
+
+    `baseline_m` is the nominal one and may be left out for a fixed rig. Raises InputError when the sizes differ,
+    CalibrationError when the rig does not fit the pictures or the baseline.
+    """
+    require_same_size(left, right)
+    if baseline_m is None:
+        low, high = rig.range_m
+        if low != high:
+            raise CalibrationError(
+                f"The calibration covers {low * 1e3:g} to {high * 1e3:g} mm; say which baseline with --baseline-m."
+            )
+        baseline_m = low
+    height, width = left.shape[:2]
+    estimator = DepthEstimator(rig, size=(width, height), settings=MatchSettings())
+    frame = StereoFrame(0, 0, left, right, BaselineEstimate(0, baseline_m, baseline_m, 0.0, False))
+    pair = estimator.rectified(frame)
+    depth = estimator.depth(frame, pair, near_m)
+    shown = pair.rectification.cam0.image(left)
+    limit, f_px = depth.near_limit_m, depth.pinhole.f_px
+    return StillDepth(shown, depth.depth_m, depth.near, depth.one_eyed, limit, depth.baseline_m, f_px)
+
+
+def halves(picture: Image) -> tuple[Image, Image]:
+    """Return the left and right half of a side-by-side picture; raises InputError when its width is odd."""
+    width = picture.shape[1]
+    if width % 2:
+        raise InputError(f"A side-by-side picture has an even width, this one is {width} px wide; name two pictures.")
+    return np.ascontiguousarray(picture[:, : width // 2]), np.ascontiguousarray(picture[:, width // 2 :])
+
+
+def require_same_size(left: Image, right: Image) -> None:
+    """Raise InputError when two pictures are not of the same size."""
+    if left.shape[:2] != right.shape[:2]:
+        sizes = [f"{eye.shape[1]}x{eye.shape[0]}" for eye in (left, right)]
+        raise InputError(
+            f"The left picture is {sizes[0]} px, the right one {sizes[1]} px; both must be the same size."
+        )
