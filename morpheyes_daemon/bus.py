@@ -109,7 +109,7 @@ class Topics:
     frame: Latest[StereoFrame] = _topic(5, "stereo frames as captured, with their baseline")
     perception: Latest[Perception] = _topic(1, "depth summary and the strategy's percept per frame")
     vehicle: Latest[VehicleState] = _topic(5, "attitude, velocity, mode, RC as the autopilot reports them")
-    observation: Latest[Any] = _topic(1, "what the strategy was given to decide on; with the percept, enough to replay")
+    observation: Latest[Any] = _topic(1, "what the strategy decided on, for replay")
     command: Latest[MissionCommand] = _topic(1, "what the mission wants")
     governed: Latest[Governed] = _topic(5, "speed limit and the bound that set it")
     sticks: Latest[Sticks] = _topic(1, "stick positions offered to the gate")

@@ -1,7 +1,7 @@
 """Messages to plain JSON values and back, for any dataclass, so that a new message is logged without new code.
 
-Not a number is null, infinities are the strings "inf" and "-inf", since JSON has neither. Arrays up to 64 numbers
-are lists that a viewer can plot, larger ones a block of base64. A value whose field does not say its type carries
+Not a number is null, infinities are the strings "inf" and "-inf", since JSON has neither. Rows of up to 64
+numbers are lists that a viewer can plot, other arrays a block of base64 with their shape. A value whose field does not say its type carries
 it under "_type". Camera images are left out: the log keeps them apart, small and compressed.
 """
 
@@ -31,7 +31,7 @@ LARGEST_LIST = 64
 OMITTED: Mapping[type, frozenset[str]] = {
     StereoFrame: frozenset({"left", "right"}),
     Perception: frozenset({"left_rect", "depth_m"}),
-    Observation: frozenset({"percept", "summary"}),
+    Observation: frozenset({"percept"}),
 }
 """Fields that are never encoded: full images, and what another channel holds already."""
 
@@ -97,7 +97,7 @@ def _plain_container(value: Any) -> Any:
 
 
 def _plain_array(array: NDArray[Any]) -> Any:
-    if array.size <= LARGEST_LIST and array.dtype.kind in "biuf":
+    if array.ndim == 1 and array.size <= LARGEST_LIST and array.dtype.kind in "biuf":
         return to_plain(array.tolist())
     data = np.ascontiguousarray(array)
     block = base64.b64encode(data.tobytes()).decode("ascii")

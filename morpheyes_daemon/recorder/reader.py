@@ -97,6 +97,15 @@ def read_flight(path: Path) -> Flight:
     return flight
 
 
+def read_header(path: Path) -> dict[str, str]:
+    """Return a log's header alone; raises InputError when the file is no log."""
+    with open_log(path) as stream:
+        for record in records(stream, Damage()):
+            if isinstance(record, Metadata) and record.name == HEADER:
+                return dict(record.metadata)
+    return {}
+
+
 def open_log(path: Path) -> IO[bytes]:
     """Open a log for reading; raises InputError with a sentence."""
     try:

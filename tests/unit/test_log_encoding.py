@@ -56,10 +56,11 @@ def test_enums_tuples_and_optional_fields_come_back_typed() -> None:
     assert back.p_ned_m == (1.0, 2.0, -3.0)
 
 
-@pytest.mark.parametrize("shape", [(3,), (40, 3)])
+@pytest.mark.parametrize("shape", [(3,), (40, 3), (0,), (0, 2), (2, 2)])
 def test_arrays_come_back_whether_listed_or_packed(shape: tuple[int, ...]) -> None:
     points = np.random.default_rng(1).normal(size=shape).astype(np.float32)
     back = through_json(Finding(points, 0.5), Finding)
+    assert back.points.shape == shape
     np.testing.assert_array_equal(back.points.astype(np.float32), points)
 
 

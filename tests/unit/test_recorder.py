@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import MonotonicClock, S
-from morpheyes_daemon.config import RecorderConfig
+from morpheyes_daemon.config import MissionFile, NoServoConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.messages import Event, Sticks
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.recorder.flight_log import CHUNK_BYTES, flight_header, flight_path
@@ -19,6 +19,8 @@ from tests.hand_clock import HandClock
 from tests.synthetic_flight import SyntheticFlight
 from tests.unit.test_spool import disk_full_at
 
+CONFIG = VehicleConfig(camera=SimCameraConfig(), servo=NoServoConfig(backend="none"))
+
 
 class Bench:
     """Topics, events, a hand-set clock and a recorder on them."""
@@ -27,9 +29,8 @@ class Bench:
         self.topics, self.events, self.clock = Topics.create(), EventLog(), HandClock()
         self.seen: list[Event] = []
         self.events.subscribe(self.seen.append)
-        header = flight_header(
-            mission="forest", config=RecorderConfig(), parameters={"k": 0.04}, calibration_hash="5f1e", wall_s=0.0
-        )
+        mission = MissionFile(strategy="forest", parameters={"baseline_gain": 0.05})
+        header = flight_header("forest", mission, CONFIG, "5f1e", 0.0)
         self.recorder = Recorder(
             self.topics, self.events, self.clock, path, header, image_rate_hz=image_rate_hz, threaded=False
         )
@@ -72,8 +73,8 @@ def test_header_says_what_flew(tmp_path: Path) -> None:
     header = flown(tmp_path, 0.1)[1].header
     assert header["mission"] == "forest"
     assert header["calibration_hash"] == "5f1e"
-    assert json.loads(header["config"])["image_rate_hz"] == 1.0
-    assert json.loads(header["parameters"]) == {"k": 0.04}
+    assert VehicleConfig.model_validate_json(header["config"]) == CONFIG
+    assert json.loads(header["mission_file"])["parameters"] == {"baseline_gain": 0.05}
     assert header["wall_time"] == "1970-01-01T00:00:00+00:00"
 
 

@@ -13,7 +13,7 @@ from morpheyes_daemon.errors import RecordingError
 from morpheyes_daemon.messages import Image
 
 MILLISECONDS = Fraction(1, 1000)
-CODEC = {"preset": "superfast", "crf": "24"}
+CODEC = {"preset": "superfast", "crf": "27"}
 
 
 class VideoWriter:
