@@ -1,0 +1,108 @@
+"""`morpheyes sim`: fly a mission in the simulator."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from morpheyes_daemon.experiments.flight import FlightPlan, Summary
+
+
+def command(
+    mission: Annotated[str, typer.Argument(help="A shipped mission by name, or a mission file.")] = "forest",
+    seed: Annotated[int, typer.Option(min=0, help="Plants the world and all noise.")] = 0,
+    baseline: Annotated[str, typer.Option(help="'variable', or a length in metres to hold.")] = "variable",
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="Fly over sockets and a pty, at the clock's pace.")
+    ] = False,
+    autopilot: Annotated[
+        str | None, typer.Option(help="A running ArduPilot SITL, such as tcp:127.0.0.1:5760; implies --realtime.")
+    ] = None,
+    rate_hz: Annotated[float, typer.Option(min=0.2, max=60.0, help="Stereo pairs per second.")] = 5.0,
+    size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "640x480",
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: out/MISSION-SEED.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Vehicle configuration; default: ./config.yaml or the shipped one.")
+    ] = None,
+    calibration: Annotated[
+        str, typer.Option(help="'solved' from rendered boards, 'exact', or a calibration file.")
+    ] = "solved",
+    world: Annotated[str | None, typer.Option(help="World by name or path, instead of the mission's own.")] = None,
+    wind_m_s: Annotated[float, typer.Option(min=0.0, max=15.0, help="Mean wind, with its gusts.")] = 2.0,
+    latency_ms: Annotated[float | None, typer.Option(min=0.0, help="Frame to depth in lockstep.")] = None,
+    limit_s: Annotated[
+        float, typer.Option(min=1.0, help="Simulated seconds until the flight counts as lost.")
+    ] = 180.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON and nothing else.")] = False,
+) -> None:
+    """Fly a mission in the simulator with the real daemon, and leave log, map, strips and film in a folder.
+
+    Exit code 0 when the goal was reached (or a gap rightly refused), 1 when not, 2 on wrong usage.
+    """
+    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.experiments.plan import make_plan
+
+    with progress_line() as report:
+        plan = make_plan(
+            mission,
+            seed=seed,
+            baseline=baseline,
+            rate_hz=rate_hz,
+            size=size,
+            config=config,
+            calibration=calibration,
+            world=world,
+            wind_m_s=wind_m_s,
+            latency_ms=latency_ms,
+            limit_s=limit_s,
+            render_threads=2,
+            progress=report,
+        )
+    folder = out or Path("out") / f"{plan.mission_name}-{seed}"
+    if realtime or autopilot:
+        from morpheyes_daemon.experiments.realtime import fly_realtime
+
+        summary = fly_realtime(plan, folder, autopilot, quiet=as_json)
+    else:
+        summary = _fly_lockstep(plan, folder, quiet=as_json)
+    typer.echo(json.dumps(summary.as_json(), indent=2) if as_json else _page(summary, folder))
+    if summary.outcome not in ("reached", "refused"):
+        raise typer.Exit(1)
+
+
+def _fly_lockstep(plan: FlightPlan, folder: Path, quiet: bool) -> Summary:
+    from morpheyes_daemon.cli.flight_line import FlightLine
+    from morpheyes_daemon.experiments.flight import Watchers, fly
+    from morpheyes_daemon.experiments.flight_outputs import FlightOutputs
+
+    outputs = FlightOutputs(folder, plan)
+    watchers = Watchers()
+    outputs.watch(watchers)
+    with FlightLine(quiet) as line:
+        watchers.progress = line.show
+        summary = fly(plan, watchers)
+        line.say("drawing the pictures")
+        outputs.finish(summary)
+    return summary
+
+
+def _page(summary: Summary, folder: Path) -> str:
+    s = summary
+    speedup = s.simulated_s / s.wall_s if s.wall_s else 0.0
+    rows = [
+        ("outcome", f"{s.outcome} ({s.reason})"),
+        ("time, path", f"{s.time_s:.1f} s, {s.path_m:.1f} m"),
+        ("speed", f"{s.mean_speed_m_s:.2f} m/s mean, {s.peak_speed_m_s:.2f} m/s peak"),
+        ("smallest clearance", f"{s.min_clearance_m:.2f} m (hull and bar to obstacle)"),
+        ("baseline", f"{s.baseline_mode}, {s.baseline_min_m * 1e3:.0f} to {s.baseline_max_m * 1e3:.0f} mm"),
+        ("calibration", s.calibration),
+        ("vision", f"{s.frames} frames of {s.image_size} at {s.perception_rate_hz:.1f} Hz"),
+        ("braking events", str(s.braking_events)),
+        ("run time", f"{s.wall_s:.1f} s for {s.simulated_s:.1f} s of flight ({speedup:.1f}x real time)"),
+        ("results", f"{folder}/map.png  strips.png  flight.mp4  flight.mcap  summary.json"),
+    ]
+    return "\n".join(f"{name:>20}  {value}" for name, value in rows)

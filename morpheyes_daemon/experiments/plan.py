@@ -1,0 +1,106 @@
+"""From what a person asks for to a flight plan; every wrong wish becomes one sentence."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+from morpheyes_daemon.calibration.views import Progress, silent
+from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.errors import UsageError
+from morpheyes_daemon.experiments.flight import FlightPlan, sim_config
+from morpheyes_daemon.experiments.stage import Scenario
+from morpheyes_daemon.shipped import find_mission, load_config, load_mission
+from morpheyes_daemon.simulation.worlds import load_world
+from morpheyes_daemon.stereo.rig import RigModel
+
+
+def make_plan(
+    mission: str,
+    *,
+    seed: int = 0,
+    baseline: str = "variable",
+    rate_hz: float = 5.0,
+    size: str = "640x480",
+    config: Path | None = None,
+    calibration: str = "solved",
+    world: str | None = None,
+    wind_m_s: float = 2.0,
+    latency_ms: float | None = None,
+    limit_s: float = 180.0,
+    render_threads: int = 1,
+    progress: Progress = silent,
+) -> FlightPlan:
+    """Return the plan of one simulated flight; raises UsageError, ConfigError or CalibrationError."""
+    file = load_mission(mission)
+    vehicle = sim_config(load_config(config), rate_hz, parse_size(size), None)
+    vehicle = hold(vehicle, parse_baseline(baseline))
+    if latency_ms is not None:
+        stereo = vehicle.stereo.model_copy(update={"latency_ms": latency_ms})
+        vehicle = vehicle.model_copy(update={"stereo": stereo})
+    place = world or file.world
+    load_world(place)
+    path = calibration_file(calibration, progress)
+    RigModel.load(path).rescaled(vehicle.camera.width_px, vehicle.camera.height_px)
+    return FlightPlan(
+        mission_name=find_mission(mission).stem,
+        mission=file,
+        config=vehicle,
+        calibration=path,
+        scenario=Scenario(place, seed, wind_m_s=wind_m_s),
+        limit_s=limit_s,
+        render_threads=render_threads,
+    )
+
+
+def with_seed(plan: FlightPlan, seed: int) -> FlightPlan:
+    """Return the same flight with another seed."""
+    return replace(plan, scenario=replace(plan.scenario, seed=seed))
+
+
+def hold(config: VehicleConfig, baseline_m: float | None) -> VehicleConfig:
+    """Return the configuration with a baseline held; raises UsageError when the rig cannot take it."""
+    low, high = config.baseline_range_m
+    if baseline_m is None:
+        return config
+    if not low <= baseline_m <= high:
+        raise UsageError(f"--baseline {baseline_m:g}: the rig goes from {low:g} to {high:g} metres.")
+    return config.model_copy(update={"hold_baseline_mm": 1e3 * baseline_m})
+
+
+def parse_baseline(text: str) -> float | None:
+    """Return the length to hold in metres, None for 'variable'; raises UsageError."""
+    if text == "variable":
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"--baseline {text}: give 'variable' or a length in metres such as 0.2.") from None
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return (width, height) of a text like 640x480; raises UsageError."""
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not found:
+        raise UsageError(f"--size {text}: give WIDTHxHEIGHT such as 640x480.")
+    width, height = int(found[1]), int(found[2])
+    if not (160 <= width <= 1920 and width * 3 == height * 4):
+        raise UsageError(f"--size {text}: the simulated camera has 4:3 images from 160x120 to 1920x1440.")
+    return width, height
+
+
+def calibration_file(kind: str, progress: Progress = silent) -> Path:
+    """Return the calibration file to fly with: solved (made once and kept), exact, or a path."""
+    from morpheyes_daemon.experiments.solved_rig import default_cache, solved_rig_file
+
+    if kind == "solved":
+        return solved_rig_file(0, progress=progress)
+    if kind == "exact":
+        from morpheyes_daemon.simulation.rig_twin import RigTwin
+
+        path = default_cache() / "exact.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        RigTwin(640, 480, 0).exact_rig().save(path)
+        return path
+    return Path(kind)
