@@ -70,10 +70,11 @@ class FlightOutputs:
         )
         header = flight_header(
             mission=plan.mission_name,
+            mission_file=plan.mission,
             config=plan.config,
-            parameters=plan.mission,
             calibration_hash=RigModel.load(plan.calibration).hash,
             wall_s=wall_time_s(),
+            scene=self._scene.as_json(),
         )
         self._recorder = Recorder(
             daemon.topics,
