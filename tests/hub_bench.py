@@ -27,7 +27,12 @@ class HubBench:
     """`async with HubBench(...)`: hub and twin run; `link` is the twin's end of the newest connection."""
 
     def __init__(
-        self, parameters: Mapping[str, float] | None = None, *, delay_s: float = DELAY_S, **config: Any
+        self,
+        parameters: Mapping[str, float] | None = None,
+        *,
+        delay_s: float = DELAY_S,
+        run_hub: bool = True,
+        **config: Any,
     ) -> None:
         self.clock: Clock = running_clock()
         self.twin = AutopilotTwin(Vehicle(), self.clock, parameters)
@@ -41,13 +46,16 @@ class HubBench:
         self._parser = mavlink.MAVLink(None)
         self._parser.robust_parsing = True
         self._delay_s = delay_s
+        self._run_hub = run_hub
         self._near: MemoryLink | None = None
         self._on_lost: OnLost = lambda reason: None
-        self.hub = AutopilotHub(AutopilotConfig(**config), self.clock, self.topics, self.log, self._open)
+        self.hub = AutopilotHub(AutopilotConfig(**config), self.clock, self.topics, self.log, self.open)
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self) -> Self:
-        self._tasks = [asyncio.create_task(self.twin.run()), asyncio.create_task(self.hub.run())]
+        self._tasks = [asyncio.create_task(self.twin.run())]
+        if self._run_hub:
+            self._tasks.append(asyncio.create_task(self.hub.run()))
         return self
 
     async def __aexit__(self, *error: object) -> None:
@@ -57,7 +65,8 @@ class HubBench:
             with suppress(asyncio.CancelledError):
                 await task
 
-    async def _open(self, url: str, on_bytes: OnBytes, on_lost: OnLost) -> Link:
+    async def open(self, url: str, on_bytes: OnBytes, on_lost: OnLost) -> Link:
+        """The twin's port as a `LinkOpener`."""
         self.opened += 1
         if not self.plugged:
             raise DeviceNotFoundError(f"{url}: unplugged.")
