@@ -96,9 +96,9 @@ def source(message: Message) -> Identity:
 
 
 def text_of(field: bytes | str) -> str:
-    """Return a character field as text; pymavlink gives either type, and bytes past a NUL are no text."""
-    raw = field.encode("latin-1") if isinstance(field, str) else field
-    return raw.split(b"\0")[0].decode("utf-8", "replace")
+    """Return a character field as text; pymavlink gives either type, and what is past a NUL is no text."""
+    text = field if isinstance(field, str) else field.decode("utf-8", "replace")
+    return text.split("\0")[0]
 
 
 class Signing:

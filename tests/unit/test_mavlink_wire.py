@@ -164,6 +164,11 @@ def test_text_fields_of_either_type(text: str) -> None:
     assert text_of(clean.encode() + b"\0junk") == clean
 
 
+def test_characters_that_pymavlink_could_not_read_stay_text() -> None:
+    message = dialect.MAVLink_param_value_message(b"RC1_\xf4\x80MIN", 1.0, 9, 1, 0)
+    assert text_of(message.param_id) == "RC1_\ufffd\ufffdMIN"
+
+
 def test_obstacles_never_look_free_because_they_are_near() -> None:
     sectors = np.full(SECTORS, np.nan, np.float32)
     sectors[:6] = [0.0, 0.01, 0.5, 9.99, 10.5, math.inf]
