@@ -166,8 +166,10 @@ def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
 
 
 def _refined(picture: Image, corners: Array, board: Board) -> Array:
-    """Move each corner to its saddle point, in a window as wide as its neighbours allow."""
-    half = np.clip(np.round(_WINDOW_SHARE * _spacing(corners, board)), *_WINDOW_LIMITS_PX)
+    """Move each corner to its saddle point, in a window as wide as its neighbours and the image's border allow."""
+    last = np.array([picture.shape[1] - 1, picture.shape[0] - 1])
+    room = np.minimum(corners, last - corners).min(axis=1) - 1.0
+    half = np.clip(np.floor(np.minimum(_WINDOW_SHARE * spacing_px(corners, board), room)), *_WINDOW_LIMITS_PX)
     refined = corners.copy()
     for window in np.unique(half[np.isfinite(half)]).astype(int):
         chosen = half == window
@@ -177,7 +179,7 @@ def _refined(picture: Image, corners: Array, board: Board) -> Array:
     return refined
 
 
-def _spacing(corners: Array, board: Board) -> Array:
+def spacing_px(corners: Array, board: Board) -> Array:
     """Return the distance (n,) of each corner to its nearest neighbour on the grid; NaN for an unseen corner."""
     grid = corners.reshape(board.rows, board.columns, 2)
     nearest = np.full(grid.shape[:2], np.inf)

@@ -44,7 +44,7 @@ def observe(
     seen = list(_detect(jobs, board, cache or CornerCache(None), progress))
     size = _common_size(seen, notes)
     views = [view for view in seen if view.size == size and view.found]
-    _note_blind(folders, seen, views, board, notes)
+    _note_blind(seen, board, notes)
     return _assembled(folders, board, size, views, notes)
 
 
@@ -171,20 +171,11 @@ def _common_size(seen: list[_View], problems: list[str]) -> tuple[int, int]:
     return size
 
 
-def _note_blind(
-    folders: list[BaselineFolder], seen: list[_View], views: list[_View], board: Board, problems: list[str]
-) -> None:
+def _note_blind(seen: list[_View], board: Board, problems: list[str]) -> None:
     for view in seen:
         if view.size is not None and not view.found:
             path = view.pair.left or view.pair.right
             problems.append(f"{path}: no {board.label} board is found; retake it, the whole board sharp and lit.")
-    counts = Counter(view.baseline for view in views if view.left is not None and view.right is not None)
-    for number, folder in enumerate(folders):
-        if counts[number] < _FEWEST_VIEWS:
-            problems.append(
-                f"{folder.folder}: the {board.label} board is found in only {counts[number]} pairs; this baseline is "
-                "left out, check --board and take at least ten pairs there."
-            )
 
 
 def _assembled(
@@ -202,6 +193,12 @@ def _assembled(
             f"{root}: the {board.label} board is found in too few pictures ({len(views)}); check the number of inner "
             "corners given by --board."
         )
+    lost = [
+        f"{folder.folder}: the {board.label} board is found in only {counts[number]} pairs, so this baseline is left "
+        "out; take at least ten pairs there."
+        for number, folder in enumerate(folders)
+        if number not in chosen
+    ]
     kept = [view for view in views if view.baseline in chosen]
     unseen = np.full((board.corner_count, 2), np.nan)
     nominal = [folders[number].nominal_m for number in chosen]
@@ -214,6 +211,7 @@ def _assembled(
         left=np.array([unseen if view.left is None else view.left for view in kept]),
         right=np.array([unseen if view.right is None else view.right for view in kept]),
         problems=tuple(problems),
+        lost=tuple(lost),
     )
 
 

@@ -49,15 +49,15 @@ def solve_observations(
 ) -> Solved:
     """Solve, check and judge; raises CalibrationError when the two sizes a person gave cannot both be right."""
     calibration, named = _without_misnamed(calibrate(observations, progress), progress)
-    problems = observations.problems + named
+    lost = observations.lost + named
     scale = scale_check(calibration)
     _refuse_scale(scale, observations.board)
     unseen = held_out(calibration, progress)
-    left_out = leave_one_out(calibration, progress)
+    left_out = leave_one_out(calibration, unseen, progress)
     uncertainty = [baseline_uncertainty(calibration, index) for index in range(len(calibration.nominal_m))]
-    verdict = judge(calibration, unseen, left_out, uncertainty, scale, problems)
+    verdict = judge(calibration, unseen, left_out, uncertainty, scale, lost)
     rig = rig_model(calibration)
-    solved = Solved(calibration, unseen, left_out, uncertainty, scale, verdict, problems, rig)
+    solved = Solved(calibration, unseen, left_out, uncertainty, scale, verdict, observations.problems + lost, rig)
     return replace(solved, rig=replace(rig, details={**(header or {}), **details(solved)}))
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from morpheyes_daemon.calibration.boards import spacing_px
 from morpheyes_daemon.calibration.bundle import Solution
 from morpheyes_daemon.calibration.projection import camera_from_vector
 from morpheyes_daemon.calibration.start import board_pose
@@ -24,6 +25,8 @@ _LEAST_PX = 0.15
 _FEWEST_CORNERS = 8
 _STRAY_SIGMAS = 8.0
 """A single corner this far off was drawn to something else, a border or a glint."""
+_STRAY_SHARE = 0.1
+_MISREAD_SQUARES = 0.5
 
 
 @dataclass(frozen=True)
@@ -62,8 +65,14 @@ def find_outliers(observations: Observations, solution: Solution) -> list[Outlie
 
 
 def without_strays(observations: Observations, solution: Solution) -> tuple[Observations, int]:
-    """Return the observations without single corners that were drawn elsewhere, and how many those were."""
-    stray = np.linalg.norm(solution.residual_px, axis=-1) > _STRAY_SIGMAS * solution.sigma_px
+    """Return the observations without single corners that were drawn elsewhere, and how many those were.
+
+    A picture with many of them, or with one that is off by half a square, was misread and is left as it is.
+    """
+    away = np.linalg.norm(solution.residual_px, axis=-1)
+    stray = away > _STRAY_SIGMAS * solution.sigma_px
+    misread = (stray & (away > _MISREAD_SQUARES * _squares_px(observations))).any(axis=-1, keepdims=True)
+    stray &= ~misread & (stray.mean(axis=-1, keepdims=True) <= _STRAY_SHARE)
     left = np.where(stray[:, 0, :, None], np.nan, observations.left)
     right = np.where(stray[:, 1, :, None], np.nan, observations.right)
     return replace(observations, left=left, right=right), int(np.count_nonzero(stray))
@@ -77,6 +86,12 @@ def without(observations: Observations, outliers: list[Outlier]) -> tuple[Observ
     seen = np.isfinite(left[..., 0]).sum(axis=1), np.isfinite(right[..., 0]).sum(axis=1)
     kept = np.maximum(*seen) >= _FEWEST_CORNERS
     return replace(observations, left=left, right=right).subset(kept), kept
+
+
+def _squares_px(observations: Observations) -> Array:
+    """Return how far apart corners are around each (V, 2, N), NaN where unseen."""
+    pictures = np.stack([observations.left, observations.right], axis=1)
+    return np.array([[spacing_px(eye, observations.board) for eye in view] for view in pictures])
 
 
 def _guilty(observations: Observations, solution: Solution, view: int, rms: Array, limit: float) -> list[int]:

@@ -51,21 +51,24 @@ class Rail:
             information[:, index, :, index] = away / component.scatter**2
         return information.reshape(count * POSE, count * POSE)
 
-    def predict(self, poses: Array, covariance: Array, nominal_m: float) -> Array:
-        """Return the pose vector (6,) expected at another nominal baseline from solved poses (M, 6).
+    def at(self, poses: Array, covariance: Array, nominal_m: Array) -> Array:
+        """Return the pose vectors (K, 6) at other nominal baselines (K,) from solved poses (M, 6).
 
-        `covariance` (6 M, 6 M) is that of the poses. This is the polynomial's mean, without any baseline's scatter.
+        The polynomial bends between the baselines, what they scatter about it is interpolated linearly: with a
+        straight rail this is the line between neighbours, with a wavy one it follows the wave. `covariance`
+        (6 M, 6 M) is that of the poses.
         """
         count = len(self.nominal_m)
         blocks = covariance.reshape(count, POSE, count, POSE)
-        at = np.array([nominal_m])
-        predicted = np.empty(POSE)
+        predicted = np.empty((len(nominal_m), POSE))
         for index, component in enumerate(self.components):
             basis = polynomial(self.nominal_m, self.nominal_m, component.order)
             spread = blocks[:, index, :, index] + np.eye(count) * component.scatter**2
             weighted = np.linalg.solve(spread, basis)
             coefficients = np.linalg.solve(basis.T @ weighted, weighted.T @ poses[:, index])
-            predicted[index] = (polynomial(at, self.nominal_m, component.order) @ coefficients)[0]
+            away = poses[:, index] - basis @ coefficients
+            smooth = polynomial(nominal_m, self.nominal_m, component.order) @ coefficients
+            predicted[:, index] = smooth + np.interp(nominal_m, self.nominal_m, away)
         return predicted
 
 

@@ -56,14 +56,20 @@ class Solved:
 
 
 def rig_model(calibration: Calibration, details: Mapping[str, Any] | None = None) -> RigModel:
-    """Return the rig model of a calibration."""
+    """Return the rig model of a calibration; baselines without rms lie between calibrated ones, on the rail."""
     state, size = calibration.solution.state, calibration.observations.size
     cam0, cam1 = (camera_from_vector(eye, size) for eye in state.eyes)
     rms = calibration.rms_px
+    sigma = [baseline_uncertainty(calibration, index) for index in range(len(calibration.nominal_m))]
+    lengths, yaws = [one.length_m for one in sigma], [one.yaw_rad for one in sigma]
+    measured = {float(nominal): float(value) for nominal, value in zip(calibration.nominal_m, rms, strict=True)}
     baselines = []
-    for index, (nominal, T) in enumerate(zip(calibration.nominal_m, calibration.poses, strict=True)):
-        sigma = baseline_uncertainty(calibration, index)
-        measures = {"rms_px": float(rms[index]), "sigma_length_m": sigma.length_m, "sigma_yaw_rad": sigma.yaw_rad}
+    for nominal, T in zip(*calibration.knots(), strict=True):
+        measures = {
+            "rms_px": measured.get(float(nominal)),
+            "sigma_length_m": float(np.interp(nominal, calibration.nominal_m, lengths)),
+            "sigma_yaw_rad": float(np.interp(nominal, calibration.nominal_m, yaws)),
+        }
         baselines.append(CalibratedBaseline.from_pose(float(nominal), T, **measures))
     return RigModel(cam0, cam1, tuple(baselines), "solved", details or {})
 

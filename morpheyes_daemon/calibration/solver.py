@@ -7,6 +7,7 @@ this is measured against.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,8 @@ from morpheyes_daemon.calibration.start import first_guess
 from morpheyes_daemon.calibration.views import Observations, Progress, silent
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
 
+KNOT_SPACING_M = 0.012
+"""The rail's waves are decimetres long: over this, a straight piece is off by a hundredth of a pixel at most."""
 _FIRST_SIGMA_PX = 0.3
 _OUTLIER_ROUNDS = 4
 _CAMERA_SIGMA = {"alpha": 0.003, "k1": 1.0, "k2": 2.0, "k3": 0.02, "k4": 0.02, "k5": 3.0}
@@ -42,6 +45,22 @@ class Calibration:
     def poses(self) -> Array:
         """T_cam0_cam1 (M, 4, 4) of every baseline."""
         return np.array([pose(R_from_rotvec(p[:3]), p[3:]) for p in self.solution.state.between])
+
+    def knots(self) -> tuple[Array, Array]:
+        """Return nominal baselines (K,) and poses (K, 4, 4) dense enough for ScLERP to follow the rail between.
+
+        They hold the calibrated baselines themselves; those between come from the rail, where there is one.
+        """
+        between = self.solution.state.between
+        if self.rail is None:
+            return self.nominal_m, self.poses
+        steps = [
+            np.linspace(a, b, int(np.ceil((b - a) / KNOT_SPACING_M)), endpoint=False)
+            for a, b in itertools.pairwise(self.nominal_m)
+        ]
+        nominal = np.concatenate([*steps, self.nominal_m[-1:]])
+        vectors = self.rail.at(between, self.solution.covariance[EYES:, EYES:], nominal)
+        return nominal, np.array([pose(R_from_rotvec(v[:3]), v[3:]) for v in vectors])
 
     @property
     def lengths_m(self) -> Array:
@@ -69,10 +88,7 @@ def calibrate(observations: Observations, progress: Progress = silent) -> Calibr
     kept = observations.subset(usable)
     prior = camera_prior(kept, start)
     progress("joint solve", 1, 3)
-    kept, solution, outliers = _robust(kept, start, prior)
-    kept, strays = without_strays(kept, solution)
-    if strays:
-        solution = bundle.solve(kept, solution.state, prior, solution.sigma_px)
+    kept, solution, outliers, strays = _robust(kept, start, prior)
     progress("learning the rail", 2, 3)
     rail = _rail(kept, solution)
     if rail is not None:
@@ -118,21 +134,25 @@ def camera_prior(observations: Observations, state: RigState) -> Prior:
 
 def _robust(
     observations: Observations, start: RigState, prior: Prior
-) -> tuple[Observations, Solution, list[Outlier]]:
-    """Solve and take outliers out until none is left."""
+) -> tuple[Observations, Solution, list[Outlier], int]:
+    """Solve and take stray corners and outlier pictures out until none is left."""
     rough = bundle.solve(observations, start, prior, _FIRST_SIGMA_PX)
     solution = bundle.solve(observations, rough.state, prior, rough.sigma_px)
     named: list[Outlier] = []
+    strays = 0
     for _ in range(_OUTLIER_ROUNDS):
+        observations, more = without_strays(observations, solution)
+        if more:
+            solution = bundle.solve(observations, solution.state, prior, solution.sigma_px)
         found = find_outliers(observations, solution)
-        if not found:
+        if not found and not more:
             break
-        named += found
+        strays, named = strays + more, named + found
         observations, kept = without(observations, found)
         state = solution.state
         state = replace(state, R_cam0_board=state.R_cam0_board[kept], t_cam0_board_m=state.t_cam0_board_m[kept])
         solution = bundle.solve(observations, state, prior, solution.sigma_px)
-    return observations, solution, named
+    return observations, solution, named, strays
 
 
 def _rail(observations: Observations, solution: Solution) -> Rail | None:

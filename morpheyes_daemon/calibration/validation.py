@@ -2,8 +2,8 @@
 
 Held out: every view is left out once and its rows are compared after rectification with what the other views gave.
 Leave one baseline out: everything taken at an inner baseline is left out, its geometry interpolated from its
-neighbours as the daemon does it, and compared with the full solve on the same boards. Both start from the full
-solution, so they cost little.
+neighbours as the daemon does it, and compared with the full solve on the same boards (held out, too). Both start
+from the full solution, so they cost little.
 """
 
 from __future__ import annotations
@@ -48,7 +48,10 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class LeftOutBaseline:
-    """One inner baseline predicted by the others; `full_epipolar_median_px` is the full solve on the same boards."""
+    """One inner baseline predicted by the others, judged on that baseline's boards, which neither has seen.
+
+    `full_epipolar_median_px` is the full solve there, with the boards held out in turn.
+    """
 
     baseline_mm: float
     epipolar_median_px: float
@@ -83,29 +86,31 @@ def held_out(calibration: Calibration, progress: Progress = silent) -> HeldOut:
     return HeldOut(np.concatenate(rows), np.concatenate(places), np.concatenate(baselines))
 
 
-def leave_one_out(calibration: Calibration, progress: Progress = silent) -> list[LeftOutBaseline]:
+def leave_one_out(calibration: Calibration, unseen: HeldOut, progress: Progress = silent) -> list[LeftOutBaseline]:
     """Return for each inner baseline how well the others predict it; empty for fewer than three baselines."""
     count = len(calibration.nominal_m)
     results = []
     for index in range(1, count - 1):
         progress("leaving one baseline out", index - 1, count - 2)
-        results.append(_left_out(calibration, index))
+        rows = np.abs(unseen.row_px[unseen.baseline == index])
+        results.append(_left_out(calibration, index, float(np.median(rows))))
     if count > 2:
         progress("leaving one baseline out", count - 2, count - 2)
     return results
 
 
-def _left_out(calibration: Calibration, index: int) -> LeftOutBaseline:
+def _left_out(calibration: Calibration, index: int, full_median_px: float) -> LeftOutBaseline:
     views = calibration.observations.baseline == index
     rest = resolve(calibration, ~views)
     nominal_m = float(calibration.nominal_m[index])
     eyes = [camera_from_vector(eye, rest.observations.size) for eye in rest.solution.state.eyes]
-    T = RigModel.from_poses(eyes[0], eyes[1], rest.nominal_m.tolist(), list(rest.poses)).T_cam0_cam1(nominal_m)
+    knots_m, poses = rest.knots()
+    T = RigModel.from_poses(eyes[0], eyes[1], knots_m.tolist(), list(poses)).T_cam0_cam1(nominal_m)
     predicted, full = StereoGeometry(eyes[0], eyes[1], T), geometry_at(calibration, index)
     return LeftOutBaseline(
         baseline_mm=nominal_m * 1e3,
         epipolar_median_px=float(np.median(np.abs(_row_errors(calibration, views, predicted)[0]))),
-        full_epipolar_median_px=float(np.median(np.abs(_row_errors(calibration, views, full)[0]))),
+        full_epipolar_median_px=full_median_px,
         baseline_error_mm=abs(predicted.length_m - full.length_m) * 1e3,
         disparity_bias_px=abs(float(np.median(infinity_px(predicted, full)))),
     )

@@ -39,18 +39,18 @@ def judge(
     left_out: list[LeftOutBaseline],
     uncertainty: list[BaselineUncertainty],
     scale: ScaleCheck,
-    problems: tuple[str, ...],
+    lost: tuple[str, ...],
 ) -> Verdict:
-    """Return the verdict on a calibration and everything its figures were made of."""
+    """Return the verdict on a calibration from its figures; `lost` says which baselines could not be used at all."""
     fatal = _fatal(calibration, held_out, scale)
     advice = [*_views(calibration), *_cells(calibration), *_yaw(calibration, uncertainty), *_rail(left_out)]
-    retake = tuple(fatal + advice)
+    retake = tuple([*fatal, *lost, *advice])
     if fatal:
         return Verdict(f"do not fly: {fatal[0]}", retake)
     if held_out.p95_px > HELD_OUT_GOOD_PX:
         return Verdict(f"fly with care: rows of held-out boards differ by {held_out.p95_px:.2f} px (95 %)", retake)
-    if advice or problems:
-        return Verdict(f"fly with care: {(advice + list(problems))[0]}", retake)
+    if advice or lost:
+        return Verdict(f"fly with care: {retake[0]}", retake)
     return Verdict(f"fit to fly: rows of held-out boards agree within {held_out.p95_px:.2f} px (95 %)", retake)
 
 

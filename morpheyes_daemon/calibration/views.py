@@ -25,6 +25,7 @@ class Observations:
 
     `left`, `right` (V, N, 2) are pixels, NaN where that eye did not see the corner; `baseline` (V,) counts into
     `nominal_m` (M,), which grows (NaN for a fixed rig of unknown length); `names` are the file names of each view.
+    `problems` are sentences on pictures left out, `lost` those on whole baselines.
     """
 
     board: Board
@@ -35,6 +36,7 @@ class Observations:
     left: Array
     right: Array
     problems: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
 
     @property
     def view_count(self) -> int:
@@ -53,6 +55,7 @@ class Observations:
             self.left[keep],
             self.right[keep],
             self.problems,
+            self.lost,
         )
 
     def at_baselines(self, chosen: list[int]) -> Observations:
@@ -68,4 +71,5 @@ class Observations:
             kept.left,
             kept.right,
             self.problems,
+            self.lost,
         )

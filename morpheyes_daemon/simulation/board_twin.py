@@ -7,6 +7,7 @@ in both eyes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Protocol, cast
 
@@ -33,8 +34,8 @@ _NEAREST_FILL = 0.92
 """The nearest board spans this share of what both eyes see ..."""
 _FARTHEST_SQUARE_PX = 9.0
 """... and the farthest one still has squares this wide."""
-_TILT_RAD = 0.75
-_TRIES = 4000
+_TILT_RAD = 0.6
+_GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
 
 class FlatBoard(Protocol):
@@ -134,39 +135,50 @@ def draw_poses(
 ) -> list[Array]:
     """Return T_rig_board (4, 4) of poses at which both eyes see the whole board.
 
-    Distances are spread evenly in 1/Z and in turn, places over the image, tilts at random.
+    Distances are spread evenly in 1/Z; every other board is moved to the edge of what both eyes see.
     """
     eyes = [(camera, inverse(rig.T_rig_eye(eye, baseline_true_m))) for eye, camera in enumerate((rig.cam0, rig.cam1))]
     middle = board.points_m.mean(axis=0)
+    points = board.points_m - middle
     near, far = _distances(rig.cam0, board, baseline_true_m)
+    turn = rng.uniform(0, 2 * math.pi)
     drawn: list[Array] = []
-    order = rng.permutation(views)
-    for k in range(views):
-        share = (order[k] + 0.5) / views
-        z = 1.0 / (1.0 / far + share * (1.0 / near - 1.0 / far))
-        drawn.append(_draw(eyes, board.points_m - middle, middle, z, far, rng))
+    for place, slot in enumerate(rng.permutation(views)):
+        inverse_z = 1.0 / far + (slot + 0.5) / views * (1.0 / near - 1.0 / far)
+        R = _tilt(rng)
+        angle = turn + _GOLDEN_RAD * place
+        share = 1.0 if place % 2 == 0 else float(rng.uniform(0.0, 1.0))
+        centre = _centre(eyes, points @ R.T, 1.0 / inverse_z, angle, share)
+        drawn.append(pose(R, centre - R @ middle))
     return drawn
 
 
-def _draw(
-    eyes: list[tuple[CameraIntrinsics, Array]],
-    points: Array,
-    middle: Array,
-    z: float,
-    far: float,
-    rng: np.random.Generator,
-) -> Array:
-    """Return one pose near distance z; moves away while the board does not fit."""
-    for attempt in range(_TRIES):
-        distance = min(z * (1.0 + 0.5 * attempt / 400), max(far, z))
-        camera = eyes[0][0]
-        reach = np.array([camera.width / camera.fx, camera.height / camera.fy]) * distance
-        place = np.array([*(rng.uniform(-0.5, 0.5, 2) * reach), distance])
-        tilt = rng.uniform(-_TILT_RAD, _TILT_RAD, 2)
-        R = R_from_rotvec(np.array([tilt[0], tilt[1], 0.0])) @ R_from_rotvec(np.array([0.0, 0.0, rng.normal(0, 0.2)]))
-        if all(_whole(camera, T_eye_rig, points @ R.T + place) for camera, T_eye_rig in eyes):
-            return pose(R, place - R @ middle)
-    return pose(np.eye(3), np.array([0.0, 0.0, far]) - middle)
+def _tilt(rng: np.random.Generator) -> Array:
+    about = rng.uniform(-_TILT_RAD, _TILT_RAD, 2)
+    return R_from_rotvec(np.array([*about, 0.0])) @ R_from_rotvec(np.array([0.0, 0.0, rng.normal(0, 0.2)]))
+
+
+def _centre(eyes: list[tuple[CameraIntrinsics, Array]], points: Array, z: float, angle: float, share: float) -> Array:
+    """Return where the board's middle is held: that share of the way from the axis to where an eye loses it.
+
+    Farther away than `z` when the board does not even fit in the middle.
+    """
+    ahead = np.array([0.0, 0.0, 1.0])
+    while not _seen(eyes, points + z * ahead):
+        z *= 1.05
+    direction = np.array([math.cos(angle), math.sin(angle), 0.0]) * z
+    inside, outside = 0.0, 1.0
+    for _ in range(12):
+        halfway = (inside + outside) / 2
+        if _seen(eyes, points + z * ahead + halfway * direction):
+            inside = halfway
+        else:
+            outside = halfway
+    return np.asarray(share * inside * direction + z * ahead)
+
+
+def _seen(eyes: list[tuple[CameraIntrinsics, Array]], p_rig: Array) -> bool:
+    return all(_whole(camera, T_eye_rig, p_rig) for camera, T_eye_rig in eyes)
 
 
 def _whole(camera: CameraIntrinsics, T_eye_rig: Array, p_rig: Array) -> bool:

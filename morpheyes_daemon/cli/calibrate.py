@@ -1,0 +1,209 @@
+"""`morpheyes calibrate`: from pictures of a board to a calibration file, and whether it is any good."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from morpheyes_daemon.calibration.boards import Board
+    from morpheyes_daemon.calibration.result import Solved
+
+app = typer.Typer(help="Calibrate the stereo rig and check it.", no_args_is_help=True, rich_markup_mode=None)
+
+BoardOption = Annotated[
+    str | None, typer.Option("--board", help="Inner corners such as 9x6, or squares such as charuco:10x7:5X5_1000.")
+]
+SquareOption = Annotated[float | None, typer.Option("--square-mm", help="Side of one square, measured.")]
+MarkerOption = Annotated[float | None, typer.Option("--marker-mm", help="Side of one marker of a ChArUco board.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
+
+
+@app.command()
+def solve(
+    folder: Annotated[Path, typer.Argument(help="One sub-folder per baseline (100mm, ...), or one folder of pairs.")],
+    out: Annotated[Path, typer.Option("--out", help="Calibration file to write.")] = Path("calibration.yaml"),
+    board: BoardOption = None,
+    square_mm: SquareOption = None,
+    marker_mm: MarkerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Solve all baselines together from pictures of a board and write the calibration file."""
+    import datetime
+
+    from morpheyes_daemon.calibration.folder_solve import read_board_file, solve_folder
+    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.clock import wall_time_s
+
+    known = read_board_file(folder) if folder.is_dir() else {}
+    chosen = _board(known, board, square_mm, marker_mm, ask=not as_json and sys.stdin.isatty())
+    today = datetime.datetime.fromtimestamp(wall_time_s(), datetime.UTC).date()
+    header = {"rig": str(known.get("rig", folder.resolve().name)), "date": today.isoformat()}
+    with progress_line() as progress:
+        solved = solve_folder(folder, chosen, out, progress, header)
+    if as_json:
+        typer.echo(json.dumps({**solved.figures(), "file": str(out)}, indent=2))
+    else:
+        _print_solved(solved, out)
+
+
+@app.command()
+def render(
+    out: Annotated[Path, typer.Argument(help="New folder for the pictures.")],
+    baselines_mm: Annotated[
+        str, typer.Option("--baselines", help="How many, equally spaced over 100-300 mm, or lengths such as 100,200.")
+    ] = "10",
+    views: Annotated[int, typer.Option("--views", min=3, max=200, help="Pairs per baseline.")] = 12,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Which twin rig.")] = 0,
+    size: Annotated[str, typer.Option("--size", help="Image size, WIDTHxHEIGHT.")] = "640x480",
+    board: BoardOption = None,
+    square_mm: SquareOption = None,
+    marker_mm: MarkerOption = None,
+) -> None:
+    """Render boards before the simulator's camera, as folders that `solve` takes."""
+    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.experiments.rendered_boards import DEFAULT_BOARD, render_folder
+
+    chosen = _board({"board": DEFAULT_BOARD.label, "square_mm": 25.0}, board, square_mm, marker_mm, checked=False)
+    nominal_m = _baselines_m(baselines_mm)
+    with progress_line() as progress:
+        render_folder(out, seed, nominal_m, views, chosen, _size(size), progress)
+    typer.echo(f"{len(nominal_m)} baselines, {views} pairs each: {out}; next: morpheyes calibrate solve {out}")
+
+
+@app.command()
+def evaluate(
+    file: Annotated[Path, typer.Argument(help="Calibration file solved from rendered boards.")],
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Which twin; default: the file's own.")] = None,
+    separate: Annotated[
+        Path | None, typer.Option("--separate", help="The rendered folder: also solve every baseline by itself.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare a solved file with the truth of the simulator's rig, at 41 baselines."""
+    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.experiments.rig_truth import compare_separate, evaluate_rig, twin_of
+    from morpheyes_daemon.stereo.rig import RigModel
+
+    rig = RigModel.load(file)
+    twin = twin_of(rig, seed, file)
+    truth = evaluate_rig(rig, twin)
+    figures: dict[str, Any] = truth.figures()
+    if separate is not None:
+        from morpheyes_daemon.calibration.folder_solve import read_board_file
+
+        chosen = _board(read_board_file(separate), None, None, None)
+        with progress_line() as progress:
+            figures["at_calibrated_baselines"] = compare_separate(separate, chosen, rig, twin, progress)
+    if as_json:
+        typer.echo(json.dumps(figures, indent=2))
+        return
+    _print_table(
+        ("baseline", "rows median", "rows 95 %", "length error", "disparity bias"),
+        [
+            (
+                f"{row.nominal_mm:g} mm",
+                f"{row.epipolar_median_px:.3f} px",
+                f"{row.epipolar_p95_px:.3f} px",
+                f"{row.baseline_error_mm:+.3f} mm",
+                f"{row.disparity_bias_px:+.3f} px",
+            )
+            for row in truth.rows[::4]
+        ],
+    )
+    typer.echo(
+        f"all 41: rows {truth.epipolar_median_px:.3f} px median, {truth.epipolar_p95_px:.3f} px at 95 %; length "
+        f"within {truth.baseline_error_max_mm:.3f} mm; disparity bias within {truth.disparity_bias_max_px:.3f} px"
+    )
+    for name, row in figures.get("at_calibrated_baselines", {}).items():
+        typer.echo(f"{name}: " + ", ".join(f"{key} {value}" for key, value in row.items()))
+
+
+def _board(
+    known: Any,
+    board: str | None,
+    square_mm: float | None,
+    marker_mm: float | None,
+    ask: bool = False,
+    checked: bool = True,
+) -> Board:
+    """Return the board from the options or else from what the folder says; raises UsageError when they disagree."""
+    from morpheyes_daemon.calibration.boards import parse_board
+    from morpheyes_daemon.errors import UsageError
+
+    written = known.get("square_mm")
+    if square_mm is None and written is None and ask:
+        square_mm = typer.prompt("Side of one square in mm, measured over several squares", type=float)
+    if square_mm is None and written is None:
+        raise UsageError("The size of the squares is missing; measure one and give it, such as --square-mm 25.")
+    if checked and square_mm is not None and written is not None and abs(square_mm / float(written) - 1) > 1e-3:
+        raise UsageError(f"--square-mm {square_mm:g} and board.yaml ({written:g} mm) disagree; correct one of them.")
+    side_mm = float(written if square_mm is None else square_mm)
+    marker = known.get("marker_mm") if marker_mm is None else marker_mm
+    label = board or str(known.get("board", "9x6"))
+    return parse_board(label, side_mm / 1e3, None if marker is None else float(marker) / 1e3)
+
+
+def _baselines_m(text: str) -> list[float]:
+    import numpy as np
+
+    from morpheyes_daemon.errors import UsageError
+    from morpheyes_daemon.simulation.rig_twin import RANGE_M
+
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise UsageError(f"--baselines {text!r} is not understood; give 10, or lengths such as 100,200.") from None
+    if len(numbers) == 1 and 2 <= numbers[0] <= 50 and numbers[0].is_integer():
+        return [round(float(b), 4) for b in np.linspace(*RANGE_M, int(numbers[0]))]
+    if not all(RANGE_M[0] * 1e3 <= number <= RANGE_M[1] * 1e3 for number in numbers):
+        raise UsageError("--baselines must lie within the rail's 100 to 300 mm.")
+    if len({round(number, 1) for number in numbers}) < len(numbers):
+        raise UsageError("--baselines names a length twice.")
+    return [round(number / 1e3, 4) for number in sorted(numbers)]
+
+
+def _size(text: str) -> tuple[int, int]:
+    from morpheyes_daemon.errors import UsageError
+
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit() and 160 <= int(width) <= 4096 and 120 <= int(height) <= 3072):
+        raise UsageError(f"--size {text!r} is not understood; give WIDTHxHEIGHT such as 640x480.")
+    return int(width), int(height)
+
+
+def _print_solved(solved: Solved, out: Path) -> None:
+    calibration = solved.calibration
+    rows = []
+    for index, nominal in enumerate(calibration.nominal_m):
+        sigma = solved.uncertainty[index]
+        rows.append(
+            (
+                f"{nominal * 1e3:g} mm",
+                f"{calibration.lengths_m[index] * 1e3:.2f} ± {sigma.length_m * 1e3:.2f} mm",
+                f"{calibration.rms_px[index]:.3f} px",
+                f"± {sigma.disparity_px:.3f} px",
+            )
+        )
+    _print_table(("nominal", "length", "rms", "disparity at infinity"), rows)
+    unseen = solved.held_out
+    typer.echo(f"held-out boards: rows {unseen.median_px:.3f} px median, {unseen.p95_px:.3f} px at 95 %")
+    for outlier in calibration.outliers:
+        typer.echo(f"outlier: {outlier.name} ({outlier.rms_px:.2f} px)")
+    for problem in solved.problems:
+        typer.echo(f"left out: {problem}", err=True)
+    for advice in solved.verdict.retake:
+        typer.echo(f"to do better: {advice}")
+    typer.echo(f"{solved.verdict.text}")
+    typer.echo(f"written: {out}; look at it with: morpheyes calibrate report {out}")
+
+
+def _print_table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    for row in [header, *rows]:
+        typer.echo("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)))
