@@ -68,7 +68,7 @@ class Autopilot:
         self.gcs_seen_ns: int | None = None
         self._gcs_lost = False
         self._ekf_bad = 0
-        self._ekf_failed = False
+        self._ekf_failed = self._ekf_passed = False
         self._idle_since_ns = vehicle.t_ns
         self._was_landed = True
         self.avoidance = True
@@ -121,10 +121,9 @@ class Autopilot:
         self._switches = AuxSwitches(self.table)
         self.estimator.boot(t_ns)
         self.gcs_seen_ns = None
-        self._gcs_lost, self._ekf_failed, self._ekf_bad = False, False, 0
+        self._gcs_lost, self._ekf_passed, self._ekf_failed, self._ekf_bad = False, False, False, 0
         self._delayed.clear()
         self.control.set_mode(_known_mode(self.table["INITIAL_MODE"]) or Mode.STABILIZE)
-        self._say(Severity.INFO, "ArduCopter V4.7.0 (twin)")
 
     def tick(self) -> None:
         """Advance by `TICK_NS`."""
@@ -277,14 +276,15 @@ class Autopilot:
         self._gcs_lost = lost
 
     def _watch_estimator(self) -> None:
-        if not self.estimator.has_origin or (self._ekf_bad == 0 and not self.armed):
+        self._ekf_passed |= self.estimator.has_origin and self.estimator.healthy
+        if not self._ekf_passed:
             return
         self._ekf_bad += -1 if self.estimator.healthy else 1
         self._ekf_bad = max(0, min(_EKF_COUNTS, self._ekf_bad))
         if self._ekf_bad == _EKF_COUNTS and not self._ekf_failed:
             self._ekf_failed = True
             self._say(Severity.CRITICAL, "EKF variance")
-            if self.mode.needs_position:
+            if self.armed and self.mode.needs_position:
                 self._act(Mode.LAND)
                 self._say(Severity.CRITICAL, "EKF Failsafe: changed to LAND Mode")
         elif self._ekf_bad == 0 and self._ekf_failed:

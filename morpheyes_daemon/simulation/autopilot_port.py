@@ -87,7 +87,7 @@ class AutopilotPort:
                 self.send_once(message_id)
         if t_ns >= self._timesync_ns:
             self._timesync_ns = t_ns + _TIMESYNC_NS
-            self.send(mavlink.MAVLink_timesync_message(0, t_ns))
+            self.send(mavlink.MAVLink_timesync_message(0, t_ns - self._autopilot.boot_ns))
         for _ in range(min(_PARAMETERS_PER_TICK, len(self._parameters))):
             self.send_parameter(self._parameters.popleft())
 

@@ -22,7 +22,19 @@ HOME_LAT_DEG, HOME_LON_DEG, HOME_ALT_M = -35.363262, 149.165237, 584.0
 
 _METRES_PER_DEG = 111_319.49
 _FIRMWARE = 4 << 24 | 7 << 16
-_SENSORS = 1 | 2 | 4 | 8 | 32 | 1024 | 2048 | 4096 | 8192 | 16384 | 65536 | 1 << 21 | 1 << 25
+_SENSORS = (
+    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
+    | mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+    | mavlink.MAV_SYS_STATUS_SENSOR_ANGULAR_RATE_CONTROL
+    | mavlink.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION
+    | mavlink.MAV_SYS_STATUS_SENSOR_YAW_POSITION
+    | mavlink.MAV_SYS_STATUS_SENSOR_Z_ALTITUDE_CONTROL
+    | mavlink.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
+    | mavlink.MAV_SYS_STATUS_AHRS
+    | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+)
 _RC_HEALTH = mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 
 
@@ -97,9 +109,13 @@ def _gps_raw(autopilot: Autopilot) -> Message:
 
 
 def _sys_status(autopilot: Autopilot) -> Message:
-    health = _SENSORS & ~(_RC_HEALTH if autopilot.rc.failsafe or not autopilot.rc.ever_seen else 0)
+    flow_only = autopilot.table.flow_only
+    aiding = mavlink.MAV_SYS_STATUS_SENSOR_OPTICAL_FLOW if flow_only else mavlink.MAV_SYS_STATUS_SENSOR_GPS
+    present = _SENSORS | _RC_HEALTH | aiding | mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    health = _SENSORS
+    health |= _RC_HEALTH if autopilot.rc.ever_seen and not autopilot.rc.failsafe else 0
+    health |= aiding if autopilot.estimator.has_position else 0
     health |= mavlink.MAV_SYS_STATUS_PREARM_CHECK if autopilot.ready_to_arm else 0
-    present = _SENSORS | _RC_HEALTH | mavlink.MAV_SYS_STATUS_PREARM_CHECK
     battery = autopilot.battery
     return mavlink.MAVLink_sys_status_message(
         present,
@@ -121,9 +137,10 @@ def _sys_status(autopilot: Autopilot) -> Message:
 def _battery_status(autopilot: Autopilot) -> Message:
     battery = autopilot.battery
     cells = [round(battery.voltage_v * 1000)] + [65535] * 9
+    charge = mavlink.MAV_BATTERY_CHARGE_STATE_LOW if battery.low else mavlink.MAV_BATTERY_CHARGE_STATE_OK
     used_mah = round((1.0 - battery.fraction) * autopilot.table["BATT_CAPACITY"])
     return mavlink.MAVLink_battery_status_message(
-        0, 0, 0, 32767, cells, round(battery.current_a * 100), used_mah, -1, round(battery.fraction * 100), 0, 1
+        0, 0, 0, 32767, cells, round(battery.current_a * 100), used_mah, -1, round(battery.fraction * 100), 0, charge
     )
 
 

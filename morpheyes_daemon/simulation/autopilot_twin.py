@@ -23,6 +23,9 @@ from morpheyes_daemon.simulation.flight_modes import Mode
 from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.vehicle import Truth, Vehicle
 
+_BOOT_NS = 2 * S
+"""How long the links are silent after a reboot."""
+
 _MOST_TICKS_AT_ONCE = 100
 """After a longer hold-up in real time the rest is skipped."""
 
@@ -56,6 +59,7 @@ class AutopilotTwin:
             vehicle, self.radio, self.parameters, noise or EstimatorNoise(), seed, ready_after_s, self._say
         )
         self._commands = Commands(self.autopilot, self.reboot)
+        self._up_ns = clock.now_ns()
 
     def attach(self, link: ByteLink) -> Callable[[bytes], None]:
         """Serve `link` from now on; returns what its received bytes must be handed to."""
@@ -75,7 +79,7 @@ class AutopilotTwin:
     def on_bytes(self, link: ByteLink, data: bytes) -> None:
         """Take bytes that arrived on `link`."""
         port = self._ports.get(id(link))
-        if port is None:
+        if port is None or self._booting:
             return
         for message in port.parse(data):
             self._route(message, port)
@@ -93,6 +97,8 @@ class AutopilotTwin:
         behind = (t_ns - self.autopilot.t_ns) // TICK_NS
         for _ in range(min(behind, _MOST_TICKS_AT_ONCE)):
             self.autopilot.tick()
+            if self._booting:
+                continue
             for port in list(self._ports.values()):
                 port.stream(self.autopilot.t_ns)
 
@@ -100,7 +106,13 @@ class AutopilotTwin:
         """Return where the vehicle really was; for simulator and judge only. Raises InputError when too old."""
         return self.autopilot.vehicle.truth_at(t_ns)
 
+    @property
+    def _booting(self) -> bool:
+        return self.autopilot.t_ns < self._up_ns
+
     def _say(self, severity: Severity, text: str) -> None:
+        if self._booting:
+            return
         for port in self._ports.values():
             port.send(mavlink.MAVLink_statustext_message(int(severity), text.encode()[:50]))
 
@@ -114,7 +126,8 @@ class AutopilotTwin:
 
     def _receive(self, message: Any, port: AutopilotPort) -> None:
         target = getattr(message, "target_system", 0)
-        if target not in (0, self._sysid):
+        component = getattr(message, "target_component", 0)
+        if target not in (0, self._sysid) or component not in (0, mavlink.MAV_COMP_ID_AUTOPILOT1):
             return
         handler = _HANDLERS.get(message.get_type())
         if handler is not None:
@@ -174,10 +187,11 @@ class AutopilotTwin:
     # Faults, for tests and the fault matrix
 
     def reboot(self) -> None:
-        """Restart the autopilot: motors stop, stream rates and the position estimate are gone."""
+        """Restart the autopilot: motors stop, links are silent for a while, rates and estimate are gone."""
+        self.autopilot.boot(self.autopilot.t_ns)
+        self._up_ns = self.autopilot.t_ns + _BOOT_NS
         for port in self._ports.values():
             port.forget()
-        self.autopilot.boot(self.autopilot.t_ns)
 
     def set_mode(self, mode: Mode) -> bool:
         """Change the flight mode as the pilot or a ground station would."""

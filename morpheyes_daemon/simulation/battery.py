@@ -26,6 +26,11 @@ class Battery:
         """Set the remaining charge, 0 to 1."""
         self.fraction = max(0.0, min(1.0, fraction))
 
+    @property
+    def low(self) -> bool:
+        """The low-voltage failsafe has been triggered."""
+        return self._failed
+
     def advance(self, dt_s: float, *, flying: bool) -> None:
         """Draw current for `dt_s`."""
         self.current_a = (_FLYING_A if flying else _IDLE_A) * (1.0 + 0.02 * self._random.gauss())

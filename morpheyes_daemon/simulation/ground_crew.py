@@ -23,7 +23,7 @@ GROUND_STATION = (255, 190)
 """System and component id of a usual ground station."""
 
 ORIGIN = (-353632620, 1491652370, 584000)
-"""Latitude and longitude (1e-7 degrees) and altitude (mm) given to an EKF without GPS; only their being set counts."""
+"""Latitude and longitude (1e-7 degrees) and altitude (mm) given to an EKF without GPS; any place will do."""
 
 _CLIMB_US, _EASE_US, _SINK_US, _IDLE_US, _MIDDLE_US = 1750, 1640, 1360, 1000, 1500
 _EASE_BELOW_M = 0.7
@@ -114,7 +114,7 @@ class GroundCrew:
 
     def _in_loiter(self) -> bool:
         heartbeat = self.latest.get("HEARTBEAT")
-        return heartbeat is not None and bool(heartbeat.custom_mode == Mode.LOITER)
+        return bool(heartbeat is not None and heartbeat.custom_mode == Mode.LOITER)
 
     def _ready(self) -> bool:
         status = self.latest.get("SYS_STATUS")
@@ -131,7 +131,7 @@ class GroundCrew:
 
     def _still(self) -> bool:
         position = self.latest["LOCAL_POSITION_NED"]
-        return abs(position.vx) < 0.2 and abs(position.vy) < 0.2 and abs(position.vz) < 0.15
+        return bool(abs(position.vx) < 0.2 and abs(position.vy) < 0.2 and abs(position.vz) < 0.15)
 
     async def _until(
         self, done: Callable[[], bool], limit_s: float, what: str, ask: Callable[[], None] | None = None
