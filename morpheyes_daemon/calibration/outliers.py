@@ -27,6 +27,7 @@ _STRAY_SIGMAS = 8.0
 """A single corner this far off was drawn to something else, a border or a glint."""
 _STRAY_SHARE = 0.1
 _MISREAD_SQUARES = 0.5
+_MISREAD_CORNERS = 2
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,13 @@ def find_outliers(observations: Observations, solution: Solution) -> list[Outlie
 def without_strays(observations: Observations, solution: Solution) -> tuple[Observations, int]:
     """Return the observations without single corners that were drawn elsewhere, and how many those were.
 
-    A picture with many of them, or with one that is off by half a square, was misread and is left as it is.
+    A picture with many of them, or with several off by half a square, was misread and is left as it is.
     """
     away = np.linalg.norm(solution.residual_px, axis=-1)
     stray = away > _STRAY_SIGMAS * solution.sigma_px
-    misread = (stray & (away > _MISREAD_SQUARES * _squares_px(observations))).any(axis=-1, keepdims=True)
-    stray &= ~misread & (stray.mean(axis=-1, keepdims=True) <= _STRAY_SHARE)
+    far = stray & (away > _MISREAD_SQUARES * _squares_px(observations))
+    misread = (far.sum(axis=-1) >= _MISREAD_CORNERS) | (stray.mean(axis=-1) > _STRAY_SHARE)
+    stray &= ~misread[..., None]
     left = np.where(stray[:, 0, :, None], np.nan, observations.left)
     right = np.where(stray[:, 1, :, None], np.nan, observations.right)
     return replace(observations, left=left, right=right), int(np.count_nonzero(stray))
