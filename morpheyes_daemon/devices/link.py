@@ -11,6 +11,7 @@ import contextlib
 import errno
 import os
 import termios
+from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import Any, Protocol, cast
 
@@ -47,6 +48,7 @@ class MemoryLink:
         self.on_bytes: OnBytes | None = None
         self.on_lost: OnLost | None = None
         self.closed = False
+        self._arriving: deque[bytes] = deque()
 
     @classmethod
     def pair(cls, delay_s: float = 0.0) -> tuple[MemoryLink, MemoryLink]:
@@ -58,9 +60,12 @@ class MemoryLink:
     def write(self, data: bytes) -> None:
         if self.closed or self._peer is None:
             return
-        self._loop.call_later(self._delay_s, self._peer._deliver, data)
+        self._peer._arriving.append(data)
+        self._loop.call_later(self._delay_s, self._peer._deliver)
 
-    def _deliver(self, data: bytes) -> None:
+    def _deliver(self) -> None:
+        """Hand over the oldest; asyncio does not keep the order of timers that are due at the same time."""
+        data = self._arriving.popleft()
         if not self.closed and self.on_bytes is not None:
             self.on_bytes(data)
 

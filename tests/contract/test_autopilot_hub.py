@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.clock import MS, S, run_virtual
-from morpheyes_daemon.errors import DeviceError, DeviceTimeoutError
+from morpheyes_daemon.clock import MS, S, run_virtual, wall_time_s
+from morpheyes_daemon.errors import ConfigError, DeviceError, DeviceTimeoutError
 from morpheyes_daemon.messages import VehicleState
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED
 from morpheyes_daemon.simulation.flight_modes import Mode
-from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride, Encoder, Identity
+from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride, Decoder, Encoder, Identity, Signing
 from tests.hub_bench import DELAY_S, HubBench
 
 VEHICLE, DAEMON, GCS = Identity(1, 1), Identity(255, 191), Identity(255, 190)
@@ -365,3 +366,42 @@ def test_hub_is_deterministic() -> None:
             return frames + [bytes(message.get_msgbuf()) for message in bench.sent]
 
     assert run_virtual(flight()) == run_virtual(flight())
+
+
+def test_signed_link_hears_nobody_unsigned_and_signs_everything(tmp_path: Path) -> None:
+    key = bytes(range(100, 132))
+    (tmp_path / "key").write_text(key.hex())
+    seen_by_peer: list[bytes] = []
+
+    async def story(bench: HubBench) -> None:
+        await bench.sleep(2.5)  # the twin signs nothing
+        assert not bench.hub.up
+        assert bench.hub.rejected_frames > 0
+        assert bench.link is not None
+        wall_s = wall_time_s()
+        for stranger in (Signing(bytes(32), wall_s), None):
+            frame = Encoder(stranger).pack(mavlink.MAVLink_heartbeat_message(2, 3, 128, Mode.LAND, 4, 3), VEHICLE)
+            bench.link.write(frame)
+        await bench.sleep(0.05)
+        assert not bench.vehicle.armed
+        signed = Encoder(Signing(key, wall_s))
+        bench.link.write(signed.pack(mavlink.MAVLink_heartbeat_message(2, 3, 128, Mode.LOITER, 4, 3), VEHICLE))
+        await bench.sleep(0.05)
+        assert bench.hub.up
+        assert bench.vehicle.armed
+        bench.hub.claim_stick_output()(RELEASE)
+        await bench.sleep(1.5)
+        seen_by_peer.extend(bytes(message.get_msgbuf()) for message in bench.sent)
+
+    with_hub(story, signing_key_file=tmp_path / "key")
+    peer = Decoder(Signing(key, wall_time_s()))
+    kinds = {message.get_type() for frame in seen_by_peer for message in peer.feed(frame)}
+    assert {"HEARTBEAT", "RC_CHANNELS_OVERRIDE", "COMMAND_LONG"} <= kinds
+    assert peer.rejected == 0
+
+
+def test_signing_key_that_cannot_be_read_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "key").write_text("not hexadecimal")
+    for path, words in [(tmp_path / "key", "hexadecimal"), (tmp_path / "none", "no such file")]:
+        with pytest.raises(ConfigError, match=words):
+            with_hub(lambda bench: bench.sleep(0.1), signing_key_file=path)

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from morpheyes_daemon.devices.link import WRITE_LIMIT_BYTES, Link, open_link
+from morpheyes_daemon.clock import run_virtual
+from morpheyes_daemon.devices.link import WRITE_LIMIT_BYTES, Link, MemoryLink, open_link
 from morpheyes_daemon.errors import ConfigError, DeviceNotFoundError
 
 Heard = asyncio.Queue[bytes]
@@ -212,3 +213,17 @@ async def test_what_cannot_be_opened_is_one_sentence(
     with pytest.raises(DeviceNotFoundError, match=words) as caught:
         await Ear().open(url(tmp_path))
     assert "\n" not in str(caught.value)
+
+
+def test_memory_link_keeps_the_order_of_what_is_written_at_once() -> None:
+    async def story() -> bytes:
+        near, far = MemoryLink.pair(0.004)
+        heard = bytearray()
+        far.on_bytes = heard.extend
+        for i in range(200):
+            near.write(bytes([i]))
+        await asyncio.sleep(0.004)
+        await asyncio.sleep(0.004)
+        return bytes(heard)
+
+    assert run_virtual(story()) == bytes(range(200))
