@@ -63,6 +63,10 @@ FIRST_DETOUR_M = 4.0
 """Flown away from the goal before turning back for the first time."""
 
 
+UNSEEN_M = 2.0
+"""Where something is taken to stand in a direction of which nothing at all is known."""
+
+
 class Phase(StrEnum):
     """What the decider is doing."""
 
@@ -146,7 +150,8 @@ class Forest(Strategy):
         bins = np.nonzero(_wide(profile.unknown))[0]
         if bins.size:
             remembered = self._memory.nearest_along(profile)[bins]
-            ranges = np.where(np.isfinite(remembered), remembered, 2.0)
+            ranges = np.where(np.isfinite(remembered), remembered, UNSEEN_M)
+            ranges = np.fmax(profile.behind_m[bins], np.where(np.isnan(profile.behind_m[bins]), ranges, 0.0))
             angle = profile.azimuth_rad[bins]
             x = profile.origin_ned_m[0] + ranges * np.cos(angle)
             y = profile.origin_ned_m[1] + ranges * np.sin(angle)

@@ -32,7 +32,8 @@ RANGE_EDGES_M: Floats = NEAREST_CELL_M * CELL_RATIO ** np.arange(CELLS + 1)
 class ObstacleProfile:
     """Obstacles in azimuth bins around the camera, ned headings; B bins from left to right.
 
-    `range_m` (B,) nearest obstacle, inf where none is seen. `unknown` (B,) bool: nothing was matched there.
+    `range_m` (B,) nearest obstacle, inf where none is seen. `unknown` (B,) bool: nothing was matched there;
+    `behind_m` (B,) then tells behind what range it must lie, NaN where nothing tells.
     `near` (B,) bool: something is closer than `near_limit_m`. `points_ned_m` (N, 2) the obstacle cells.
     `origin_ned_m` is the camera, horizontally; `p_ned_m` the vehicle at exposure.
     """
@@ -43,6 +44,7 @@ class ObstacleProfile:
     azimuth_rad: Floats
     range_m: Floats
     unknown: NDArray[np.bool_]
+    behind_m: Floats
     near: NDArray[np.bool_]
     points_ned_m: Floats
     trust_m: float
@@ -91,11 +93,13 @@ def obstacle_profile(view: View, band_m: float, trust_m: float, bin_rad: float =
     looked = np.bincount(index[level], minlength=bins)
     matched = np.bincount(index[level & known], minlength=bins)
     too_near = np.bincount(index[level & depth.near[::stride, ::stride].ravel()], minlength=bins)
+    shadowed = np.bincount(index[level & depth.one_eyed[::stride, ::stride].ravel()], minlength=bins)
     near = too_near > 0.4 * np.maximum(looked, 1)
     unknown = (matched < 0.35 * np.maximum(looked, 1)) & ~near
 
     first = np.where(occupied.any(axis=1), RANGE_EDGES_M[np.argmax(occupied, axis=1)], np.inf)
     first = np.where(near, np.minimum(first, depth.near_limit_m), first)
+    unknown &= ~np.isfinite(first)
     azimuth = centre_rad + (np.arange(bins) + 0.5) * (2 * half_rad / bins) - half_rad
     origin = (float(T[0, 3]), float(T[1, 3]))
     return ObstacleProfile(
@@ -104,7 +108,8 @@ def obstacle_profile(view: View, band_m: float, trust_m: float, bin_rad: float =
         origin_ned_m=origin,
         azimuth_rad=azimuth,
         range_m=first,
-        unknown=unknown & ~np.isfinite(first),
+        unknown=unknown,
+        behind_m=_behind(unknown, shadowed > 0.5 * np.maximum(looked, 1), first),
         near=near,
         points_ned_m=_points(occupied & (counts > 0), near, azimuth, origin, depth.near_limit_m),
         trust_m=trust_m,
@@ -137,6 +142,23 @@ def _support_needed(pinhole: Pinhole, stride: int, band_m: float, bin_rad: float
     rows = np.minimum(rows, pinhole.height / stride)
     columns = max(1.0, bin_rad * pinhole.f_px / stride)
     return np.asarray(np.maximum(2.0, 0.2 * rows * columns))
+
+
+def _behind(unknown: NDArray[np.bool_], shadowed: NDArray[np.bool_], range_m: Floats) -> Floats:
+    """What only the left eye sees lies behind the obstacle to its right, whose shadow it is; (B,) NaN elsewhere.
+
+    The strip along the left border is the right eye's missing view, not a shadow, and nothing tells its range.
+    """
+    behind = np.full(range_m.shape, np.nan)
+    occluder = np.nan
+    for i in range(len(range_m) - 1, -1, -1):
+        if not unknown[i]:
+            occluder = range_m[i] if np.isfinite(range_m[i]) else np.nan
+        elif shadowed[i]:
+            behind[i] = occluder
+    border = int(np.argmin(unknown)) if not unknown.all() else len(unknown)
+    behind[:border] = np.nan
+    return behind
 
 
 def _points(
