@@ -53,6 +53,26 @@ def solve(
 
 
 @app.command()
+def report(
+    file: Annotated[Path, typer.Argument(help="Calibration file.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Page to write, .html or .png.")] = None,
+    matcher_px: Annotated[float, typer.Option("--matcher-px", min=0.01, max=5, help="Matcher, 1 sigma.")] = 0.25,
+    servo_mm: Annotated[float, typer.Option("--servo-mm", min=0, max=5, help="Servo repeatability, 1 sigma.")] = 0.1,
+    sync_ms: Annotated[float, typer.Option("--sync-ms", min=0, max=100, help="Time between the eyes.")] = 2.0,
+    sideways_m_s: Annotated[float, typer.Option("--sideways", min=0, max=20, help="Sideways speed, m/s.")] = 0.5,
+) -> None:
+    """Write a page that shows how good a calibration is, what depth errors to expect, and what to retake."""
+    from morpheyes_daemon.calibration.budget import Conditions
+    from morpheyes_daemon.calibration.report import write_report
+    from morpheyes_daemon.stereo.rig import RigModel
+
+    page = file.with_suffix(".html") if out is None else out
+    conditions = Conditions(matcher_px, servo_mm / 1e3, sync_ms / 1e3, sideways_m_s)
+    write_report(RigModel.load(file), page, conditions)
+    typer.echo(f"{page}")
+
+
+@app.command()
 def render(
     out: Annotated[Path, typer.Argument(help="New folder for the pictures.")],
     baselines_mm: Annotated[
