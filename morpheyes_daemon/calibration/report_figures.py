@@ -21,6 +21,9 @@ INK, MUTED, GRID = "#1c2430", "#66707f", "#e3e7ec"
 BLUE, ORANGE, GREEN, RED, PURPLE = "#2f6fde", "#e8833a", "#2a9d6f", "#d1453b", "#8a63d2"
 CAUSES = (("matcher", BLUE), ("yaw", ORANGE), ("baseline length", GREEN), ("time offset", PURPLE))
 _WIDE, _HALF = (9.6, 3.1), (4.7, 3.1)
+_GOOD_ROW_PX = 0.2
+"""The map's colours reach at least this far, so that a good rig does not look alarming."""
+_FEWEST_BARS = 5
 
 
 def calibrated(rig: RigModel) -> list[CalibratedBaseline]:
@@ -44,7 +47,7 @@ def coverage_map(rig: RigModel) -> Figure | None:
             at = _cell_centre(rig, counts.shape, row, column)
             ax.text(*at, "none", ha="center", va="center", color=RED, size=8)
         ax.set_title(f"{eye} eye: {np.mean(counts > 0):.0%} of the image", loc="left")
-    figure.colorbar(image, ax=axes, label="corners seen", shrink=0.9)
+    _bar_of_colours(figure, image, axes, "corners seen")
     return figure
 
 
@@ -64,6 +67,7 @@ def rms_bars(rig: RigModel) -> Figure | None:
     if len(views) == len(chosen):
         labels = [f"{label}\n{count} views" for label, count in zip(labels, views, strict=True)]
     ax.set_xticks(x, labels)
+    _room_for_bars(ax, len(chosen))
     ax.set_xlabel("nominal baseline, mm")
     ax.set_ylabel("px")
     ax.legend(loc="upper left", bbox_to_anchor=(0, 1.18), ncols=2)
@@ -77,13 +81,13 @@ def held_out_map(rig: RigModel) -> Figure | None:
         return None
     values = np.array([[np.nan if value is None else value for value in row] for row in cells], dtype=float)
     figure, ax = _plot(_HALF)
-    top = max(0.02, float(np.nanpercentile(values, 95)) * 1.15)
+    top = max(_GOOD_ROW_PX, float(np.nanpercentile(values, 95)) * 1.15)
     image = _cells(ax, values, rig, "YlOrRd", 0.0, top)
     for (row, column), value in np.ndenumerate(values):
         text, color = ("–", MUTED) if np.isnan(value) else (f"{value:.2f}", "white" if value > 0.65 * top else INK)
         ax.text(*_cell_centre(rig, values.shape, row, column), text, ha="center", va="center", color=color, size=7)
     ax.set_title("left image, median of |row difference|", loc="left")
-    figure.colorbar(image, ax=ax, label="px")
+    _bar_of_colours(figure, image, ax, "px")
     return figure
 
 
@@ -161,6 +165,7 @@ def depth_error_bars(rig: RigModel, conditions: Conditions) -> Figure:
         ax.set_xticks(x, [f"{error.nominal_m * 1e3:g}" for error in at], size=8)
         ax.set_title(f"at {distance:g} m: one sigma, cm", loc="left")
         ax.margins(y=0.15)
+        _room_for_bars(ax, len(at))
     axes[0].legend(ncols=2, fontsize=8)
     figure.supxlabel("nominal baseline, mm", size=9, color=MUTED)
     return figure
@@ -185,6 +190,19 @@ def _style(ax: Axes) -> None:
     ax.yaxis.label.set_fontsize(9)
     ax.title.set_fontsize(10)
     ax.title.set_color(INK)
+
+
+def _room_for_bars(ax: Axes, count: int) -> None:
+    """Keep a lone bar from filling the whole plot."""
+    half = max(count, _FEWEST_BARS) / 2
+    ax.set_xlim((count - 1) / 2 - half, (count - 1) / 2 + half)
+
+
+def _bar_of_colours(figure: Figure, image: Any, ax: Any, label: str) -> None:
+    bar = figure.colorbar(image, ax=ax, shrink=0.9)
+    bar.set_label(label, size=9, color=MUTED)
+    bar.ax.tick_params(labelsize=8, colors=MUTED, length=0)
+    bar.outline.set_visible(False)
 
 
 def _cells(ax: Axes, values: Any, rig: RigModel, colours: str, low: float, high: float) -> Any:
