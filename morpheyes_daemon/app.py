@@ -42,6 +42,9 @@ from morpheyes_daemon.tasks.obstacles import obstacles
 from morpheyes_daemon.tasks.sticks import sticks
 from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride
 
+ALARMS = frozenset({Reason.OVERRIDE_IGNORED, Reason.AUTOPILOT_REBOOTED})
+"""What the hub reports that ends a flight in HOLD."""
+
 STATE_NUMBERS: dict[State, int] = {state: number for number, state in enumerate(State)}
 """What NAMED_VALUE_INT carries for a state."""
 
@@ -82,6 +85,7 @@ class Daemon:
         fixed_m = config.baseline_range_m[0]
         self._where = self._model or FixedBaseline(fixed_m)
         self.hub.on_vehicle(self._on_vehicle)
+        events.subscribe(self._on_event)
         self.hub.parameters.on_change(self._on_parameters)
         self.supervisor = Supervisor(
             self._tasks(), self.guardian, events, parts.clock, config.safety.supervisor_timeout_s
@@ -197,6 +201,10 @@ class Daemon:
     def _on_vehicle(self, vehicle: VehicleState) -> None:
         self.guardian.on_vehicle(vehicle, self._clock.now_ns())
         self.track.add(vehicle)
+
+    def _on_event(self, event: Event) -> None:
+        if event.source == "autopilot" and event.reason in ALARMS:
+            self.guardian.alarm(event.reason, event.t_ns)
 
     def _on_parameters(self, values: Mapping[str, float]) -> None:
         """The autopilot's own numbers, new: how it flies and where its sticks end."""

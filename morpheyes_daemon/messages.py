@@ -144,7 +144,7 @@ class Perception:
 class VehicleState:
     """The newest of what the autopilot said, each group with its own stamp (0: never heard).
 
-    `rc_us` are RC_CHANNELS 1..16 (0: absent). `position_t_ns` stamps p and v. `custom_mode` is ArduCopter's number.
+    `rc_us` are RC_CHANNELS 1..16 (0: absent), `rc_rssi` their signal strength 0..254 (255: not measured). `position_t_ns` stamps p and v. `custom_mode` is ArduCopter's number.
     """
 
     t_ns: int = 0
@@ -164,6 +164,7 @@ class VehicleState:
     system_status: int = 0
     rc_t_ns: int = 0
     rc_us: tuple[int, ...] = ()
+    rc_rssi: int = 255
     ekf_t_ns: int = 0
     ekf_flags: int = 0
     battery_t_ns: int = 0

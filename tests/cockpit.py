@@ -18,7 +18,7 @@ from tests.guardian_witness import Witness
 
 LIMITS = StickLimits((1000, 1010, 1020, 1000), (2000, 1990, 1980, 2000), (1500, 1490, 1500, 1510))
 OTHER_LIMITS = StickLimits((1100, 1100, 1100, 1100), (1900, 1900, 1900, 1900), (1480, 1520, 1500, 1500), 2500.0)
-HEALTHY = {"custom_mode": 5, "armed": True, "landed": False, "system_status": 4, "ekf_flags": 0x08}
+HEALTHY = {"custom_mode": 5, "armed": True, "landed": False, "system_status": 4, "ekf_flags": 0x08, "rc_rssi": 200}
 OFF_US, ON_US = 1000, 1900
 
 

@@ -109,7 +109,7 @@ class Witness:
             now_ns - vehicle.gcs_t_ns >= self.limits.gcs_timeout_s * S
         )
         empty = 0.0 <= vehicle.battery_fraction < self.limits.battery_low
-        return not position or vehicle.system_status > 4 or empty or gcs_lost
+        return not position or vehicle.system_status > 4 or vehicle.rc_rssi == 0 or empty or gcs_lost
 
     def _may_hold(self) -> bool:
         """As far as heard: armed, in Loiter."""

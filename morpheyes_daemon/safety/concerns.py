@@ -33,6 +33,7 @@ def concern(vehicle: VehicleState, now_ns: int, battery_low: float, gcs_timeout_
     `gcs_timeout_s` None does not watch the ground station.
     """
     rows = (
+        (Reason.RC_LOST, vehicle.rc_rssi == 0),
         (Reason.FAILSAFE, vehicle.system_status >= CRITICAL),
         (Reason.EKF_UNHEALTHY, not ekf_healthy(vehicle)),
         (Reason.BATTERY_LOW, 0.0 <= vehicle.battery_fraction < battery_low),

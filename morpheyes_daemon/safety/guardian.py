@@ -42,6 +42,9 @@ RESUMED = frozenset(
 )
 """Braking for these, and only these, may end in flying on; while the pilot was not heard he may have taken over."""
 
+DEAF = frozenset({Reason.LINK_LOST, Reason.RC_LOST})
+"""While these last the pilot cannot be heard taking the sticks back."""
+
 NOT_RESUMED = (Reason.GOAL_REACHED, Reason.MISSION_REFUSED, Reason.SHUTDOWN)
 """Stops that somebody asked for, as against braking for want of something."""
 
@@ -159,6 +162,11 @@ class Guardian:
         self._faults.pop((reason, source), None)
         if not self._faults:
             self._fire(Trigger.CLEARED, Reason.RECOVERED, now_ns)
+
+    def alarm(self, reason: Reason, now_ns: int) -> None:
+        """Something happened in flight that forbids to fly on, though no part failed and nothing can be cleared."""
+        if self.state in HOLDING:
+            self._brake(Trigger.FAULT, reason, now_ns)
 
     def mission_over(self, reason: Reason, now_ns: int) -> None:
         """The mission is done or refuses; stop and wait for the pilot."""
@@ -283,14 +291,14 @@ class Guardian:
 
     def _judge_flight(self, now_ns: int) -> None:
         lease = self.gate.stale(now_ns)
+        stale = LEASE_REASONS[lease] if lease is not None else None
         worry = self._concern(now_ns) or self._idleness(now_ns)
         if worry is not None:
             self._worry(worry, now_ns)
-        if lease is not None and not self._latched:
-            self._judge_lease(LEASE_REASONS[lease], now_ns)
-        if self._deaf_too_long(lease, now_ns):
-            self._fire(Trigger.LET_GO, Reason.LINK_LOST, now_ns)
-        elif self.state is State.BRAKING:
+        if stale is not None and not self._latched:
+            self._judge_lease(stale, now_ns)
+        self._judge_deafness(next((reason for reason in (stale, worry) if reason in DEAF), None), now_ns)
+        if self.state is State.BRAKING:
             self._judge_braking(lease, now_ns)
 
     def _judge_lease(self, reason: Reason, now_ns: int) -> None:
@@ -310,14 +318,15 @@ class Guardian:
         elif self._at_rest(now_ns) or held_s >= 2.0 * neutral_s:
             self._fire(Trigger.STOPPED, self.reason, now_ns)
 
-    def _deaf_too_long(self, lease: Lease | None, now_ns: int) -> bool:
-        """Sticks are held only while the pilot can be heard taking them back: his mode comes with the heartbeat."""
-        if lease is not Lease.LINK:
+    def _judge_deafness(self, deaf: Reason | None, now_ns: int) -> None:
+        """Sticks are held only while the pilot can be heard taking them back."""
+        if deaf is None:
             self._deaf_since_ns = None
-            return False
+            return
         if self._deaf_since_ns is None:
             self._deaf_since_ns = now_ns
-        return now_ns - self._deaf_since_ns >= self._limits.neutral_before_release_s * S
+        if now_ns - self._deaf_since_ns >= self._limits.neutral_before_release_s * S:
+            self._fire(Trigger.LET_GO, deaf, now_ns)
 
     def _at_rest(self, now_ns: int) -> bool:
         known = self.gate.is_fresh(Lease.VEHICLE, now_ns)

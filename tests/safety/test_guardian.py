@@ -595,6 +595,22 @@ def test_engaging_without_any_offer_is_a_fault_too() -> None:
     assert cockpit.now_ns - engaged_ns == round(IDLE_S * S) + 20 * MS
 
 
+@pytest.mark.parametrize("reason", [Reason.OVERRIDE_IGNORED, Reason.AUTOPILOT_REBOOTED])
+def test_an_alarm_in_flight_stops_for_good_and_outside_means_nothing(reason: Reason) -> None:
+    cockpit = Cockpit().stand_by()
+    cockpit.guardian.alarm(reason, cockpit.now_ns)
+    is_in(cockpit, State.STANDBY, Reason.READY)
+    cockpit.engage()
+    count = len(cockpit.sent)
+    cockpit.guardian.alarm(reason, cockpit.now_ns)
+    assert [(out.action, out.reason) for out in cockpit.sent[count:]] == [(Action.NEUTRAL, reason)]
+    assert actions(cockpit, 5.0) == {Action.NEUTRAL}
+    is_in(cockpit, State.HOLD, reason)
+    cockpit.switch_us = OFF_US
+    cockpit.run(0.3)
+    cockpit.engage()
+
+
 # -- deafness, clock and pauses ---------------------------------------------------------------------------------
 
 
@@ -624,6 +640,18 @@ def test_a_link_that_comes_and_goes_is_counted_anew() -> None:
     cockpit.silent.add(Lease.LINK)
     cockpit.run(2.6)
     is_in(cockpit, State.RELEASED, Reason.LINK_LOST)
+
+
+def test_a_lost_radio_is_let_go_so_that_the_autopilot_can_act() -> None:
+    """While we stream, the autopilot takes our overrides for a radio and starts no failsafe."""
+    cockpit = Cockpit().engage()
+    cockpit.hear(rc_rssi=0)
+    outs = cockpit.run(2.1)
+    assert [out.action for out in outs].count(Action.NEUTRAL) == 100
+    is_in(cockpit, State.RELEASED, Reason.RC_LOST)
+    cockpit.hear(rc_rssi=200)
+    cockpit.run(1.5)
+    assert actions(cockpit, 5.0) == {Action.SILENT}
 
 
 def test_a_lost_link_in_hold_is_let_go_too() -> None:

@@ -116,7 +116,9 @@ class Chaos(Cockpit):
         self.mission_over(self._rng.choice((Reason.GOAL_REACHED, Reason.MISSION_REFUSED)))
 
     def _trouble(self) -> None:
-        self.hear(**self._rng.choice(({"system_status": 5}, {"ekf_flags": 0x88}, {"battery_fraction": 0.1})))
+        self.hear(
+            **self._rng.choice(({"system_status": 5}, {"ekf_flags": 0x88}, {"battery_fraction": 0.1}, {"rc_rssi": 0}))
+        )
 
     def _pause(self) -> None:
         self.wait(round(self._rng.choice((0.3, 0.99, 1.01, 5.0)) * S))

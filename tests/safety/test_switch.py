@@ -7,7 +7,7 @@ import math
 import pytest
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.safety.switch import ASKING_NS, NARROWEST_US, STEADY_NS, WIDEST_US, EngageSwitch
+from morpheyes_daemon.safety.switch import ASKING_NS, STEADY_NS, EngageSwitch
 
 START_NS = 1000 * S
 OFF, ON = 1000, 1900
@@ -114,7 +114,7 @@ def test_a_gap_while_on_needs_a_new_flip() -> None:
     assert not pilot.puts(ON, 300).asks
 
 
-@pytest.mark.parametrize("width", [0, 65535, NARROWEST_US - 1, WIDEST_US + 1, math.nan, math.inf, -1])
+@pytest.mark.parametrize("width", [0, 65535, 799, 2201, math.nan, math.inf, -1])
 def test_a_pulse_that_is_none_forgets_what_was_seen(width: float) -> None:
     pilot = Pilot().puts(OFF)
     assert pilot.switch.hear(pilot.now_ns + 1, width) is None
@@ -124,7 +124,7 @@ def test_a_pulse_that_is_none_forgets_what_was_seen(width: float) -> None:
 
 @pytest.mark.parametrize(
     ("width", "on"),
-    [(NARROWEST_US, False), (ABOVE, False), (ABOVE + 1, True), (ABOVE + 0.5, True), (WIDEST_US, True)],
+    [(800, False), (ABOVE, False), (ABOVE + 1, True), (ABOVE + 0.5, True), (2200, True)],
 )
 def test_what_is_on(width: float, on: bool) -> None:
     assert EngageSwitch(ABOVE, S).hear(START_NS, width) is on

@@ -88,6 +88,7 @@ class Telemetry:
         return {
             "rc_t_ns": self.boot.stamp_ns(message.time_boot_ms, now_ns),
             "rc_us": tuple(0 if width == 65535 else width for width in widths),
+            "rc_rssi": message.rssi,
         }
 
     def _distance(self, message: Message, now_ns: int) -> dict[str, Any] | None:
