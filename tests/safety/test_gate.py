@@ -12,11 +12,7 @@ from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages import Sticks
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import (
-    LATE_NS,
     LEASE_REASONS,
-    LONGEST_LEASE_NS,
-    RELEASE_REPEAT_S,
-    RELEASE_REPEATS,
     Gate,
     GateOutput,
     Lease,
@@ -26,6 +22,7 @@ from morpheyes_daemon.safety.states import EFFECTS, HOLDING, Action, State
 
 LIMITS = StickLimits((1000, 1010, 1020, 1030), (2000, 1990, 1980, 1970), (1500, 1490, 1510, 1505))
 NEUTRAL = LIMITS.neutral
+LATE_NS, LONGEST_LEASE_NS, RELEASE_REPEATS = 100 * MS, 10 * S, 20
 SLOW_US = 80
 """4000 us/s over one period of 20 ms."""
 
@@ -308,7 +305,6 @@ def test_a_release_is_repeated_for_its_time_and_then_there_is_silence() -> None:
     bench.gate.release(State.PILOT, Reason.SWITCH_OFF, bench.now_ns)
     actions = [bench.step(State.PILOT).action for _ in range(60)]
     assert actions == [Action.RELEASE] * 50 + [Action.SILENT] * 10
-    assert round(RELEASE_REPEAT_S * S) == 50 * 20 * MS
     assert bench.gate.silent
     assert bench.sent[-1].action is Action.RELEASE
 

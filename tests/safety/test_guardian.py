@@ -12,10 +12,7 @@ from morpheyes_daemon.config import AutopilotConfig, NoServoConfig, SafetyConfig
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import LEASE_REASONS, RELEASE_REPEATS, Lease
 from morpheyes_daemon.safety.guardian import (
-    AT_REST_M_S,
-    IDLE_S,
     NOT_RESUMED,
-    PAUSE_S,
     RESUMED,
     Guardian,
     GuardianLimits,
@@ -23,6 +20,7 @@ from morpheyes_daemon.safety.guardian import (
 from morpheyes_daemon.safety.states import EFFECTS, HOLDING, Action, State, Trigger
 from tests.cockpit import LIMITS, OFF_US, ON_US, OTHER_LIMITS, Actor, Cockpit
 
+AT_REST_M_S, IDLE_S, PAUSE_S = 0.15, 1.0, 0.5
 OUTSIDE = [state for state in State if state not in HOLDING]
 OWN = [lease for lease in Lease if LEASE_REASONS[lease] in RESUMED]
 PILOTS = [Lease.LINK, Lease.SWITCH]

@@ -7,9 +7,10 @@ import math
 import pytest
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.safety.switch import ASKING_NS, STEADY_NS, EngageSwitch
+from morpheyes_daemon.safety.switch import EngageSwitch
 
 START_NS = 1000 * S
+STEADY_NS, ASKING_NS = 200 * MS, S
 OFF, ON = 1000, 1900
 ABOVE = 1700
 
