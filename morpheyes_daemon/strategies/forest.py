@@ -23,7 +23,7 @@ from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, StrategyParameters, View
 from morpheyes_daemon.strategies.corridor import free_distance_m
 from morpheyes_daemon.strategies.memory import ObstacleMemory
-from morpheyes_daemon.strategies.profile import Floats, ObstacleProfile, obstacle_profile
+from morpheyes_daemon.strategies.profile import Floats, ObstacleProfile, obstacle_profile, wide_runs
 from morpheyes_daemon.transforms import wrap_rad
 
 
@@ -63,6 +63,9 @@ FIRST_DETOUR_M = 4.0
 """Flown away from the goal before turning back for the first time."""
 
 
+SEEN_S = 1.2
+"""A direction without depth goes by what was known of it for this long; a hard stop takes about as long."""
+
 UNSEEN_M = 2.0
 """Where something is taken to stand in a direction of which nothing at all is known."""
 
@@ -83,7 +86,9 @@ class Forest(Strategy):
 
     def __init__(self, parameters: ForestParameters, craft: Craft) -> None:
         super().__init__(parameters, craft)
-        self._memory = ObstacleMemory(max(parameters.memory_s, 10 * craft.frame_period_s))
+        self._memory = ObstacleMemory(
+            max(parameters.memory_s, 10 * craft.frame_period_s), max(SEEN_S, 2.5 * craft.frame_period_s)
+        )
         self._turn = Pid(PidGains(*parameters.turn_gains))
         self._goal_ned_m: tuple[float, float] | None = None
         self._height_m = parameters.height_m
@@ -110,9 +115,9 @@ class Forest(Strategy):
         """Return velocity, heading and baseline until the next frame."""
         profile: ObstacleProfile = observation.percept
         vehicle = observation.vehicle
-        self._memory.add(profile)
         if not observation.engaged or self._goal_ned_m is None:
             self._settle(vehicle)
+        self._memory.add(profile)
         dt_s = min(2.0, max(1e-3, (observation.now_ns - self._last_ns) / S)) if self._last_ns else 0.2
         self._last_ns = observation.now_ns
         assert self._goal_ned_m is not None
@@ -132,7 +137,8 @@ class Forest(Strategy):
         return self._fly(choice, obstacles, observation, dt_s, distance_m)
 
     def _settle(self, vehicle: VehicleState) -> None:
-        """Before the mission engages: the goal and the height follow the vehicle."""
+        """Before the mission engages: goal and height follow the vehicle, and what the climb showed is forgotten."""
+        self._memory.clear()
         goal = self.parameters.goal
         cos, sin = math.cos(vehicle.yaw_rad), math.sin(vehicle.yaw_rad)
         self._goal_ned_m = (
@@ -147,7 +153,7 @@ class Forest(Strategy):
     def _obstacles(self, profile: ObstacleProfile, observation: Observation) -> Floats:
         """Every known obstacle point (N, 2) relative to the vehicle; what is unknown for long counts as one."""
         points = [self._memory.points_ned_m]
-        bins = np.nonzero(_wide(profile.unknown))[0]
+        bins = np.nonzero(wide_runs(profile.unknown, 3) & ~self._memory.seen_lately(profile))[0]
         if bins.size:
             remembered = self._memory.nearest_along(profile)[bins]
             ranges = np.where(np.isfinite(remembered), remembered, UNSEEN_M)
@@ -156,7 +162,7 @@ class Forest(Strategy):
             x = profile.origin_ned_m[0] + ranges * np.cos(angle)
             y = profile.origin_ned_m[1] + ranges * np.sin(angle)
             points.append(np.stack([x, y], axis=1))
-        return np.concatenate(points) - np.array(observation.vehicle.p_ned_m[:2])
+        return np.asarray(np.concatenate(points) - np.array(observation.vehicle.p_ned_m[:2]))
 
     def _half_width_m(self, margin_m: float, baseline_m: float) -> float:
         return self.craft.footprint.width_m(baseline_m) / 2 + margin_m
@@ -319,20 +325,6 @@ class Forest(Strategy):
 def _right_is_freer(profile: ObstacleProfile) -> bool:
     left, right = np.array_split(np.minimum(profile.range_m, profile.trust_m), 2)
     return float(right.mean()) >= float(left.mean())
-
-
-def _wide(flags: np.ndarray[tuple[int], np.dtype[np.bool_]], least: int = 3) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Keep runs of at least `least` set bins; thinner ones lie between two that are known."""
-    kept = np.zeros_like(flags)
-    start = None
-    for i, flag in enumerate([*flags, False]):
-        if flag and start is None:
-            start = i
-        elif not flag and start is not None:
-            if i - start >= least:
-                kept[start:i] = True
-            start = None
-    return kept
 
 
 def _wrapped(angle_rad: Floats) -> Floats:

@@ -25,7 +25,10 @@ CELL_RATIO = 1.05
 CELLS = 110
 """Range cells from 0.25 m to 53 m, each 5 % wider than the one before."""
 
-RANGE_EDGES_M: Floats = NEAREST_CELL_M * CELL_RATIO ** np.arange(CELLS + 1)
+NEAR_BINS = 4
+"""What is closer than the near limit fills many bins (a 0.1 m trunk at 1.4 m: 13); thinner runs are mismatches."""
+
+RANGE_EDGES_M: Floats = NEAREST_CELL_M * np.power(CELL_RATIO, np.arange(CELLS + 1, dtype=np.float64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +63,10 @@ def _rays(pinhole: Pinhole, stride: int) -> Floats:
     return np.stack([x, y, np.ones_like(x)])
 
 
-def obstacle_profile(view: View, band_m: float, trust_m: float, bin_rad: float = math.radians(0.6)) -> ObstacleProfile:
+BIN_RAD = math.radians(0.6)
+
+
+def obstacle_profile(view: View, band_m: float, trust_m: float, bin_rad: float = BIN_RAD) -> ObstacleProfile:
     """Gather the obstacles within `band_m` above and below the vehicle into azimuth bins.
 
     `trust_m` is how far depth is believed; obstacles beyond it are kept out.
@@ -94,13 +100,13 @@ def obstacle_profile(view: View, band_m: float, trust_m: float, bin_rad: float =
     matched = np.bincount(index[level & known], minlength=bins)
     too_near = np.bincount(index[level & depth.near[::stride, ::stride].ravel()], minlength=bins)
     shadowed = np.bincount(index[level & depth.one_eyed[::stride, ::stride].ravel()], minlength=bins)
-    near = too_near > 0.4 * np.maximum(looked, 1)
-    unknown = (matched < 0.35 * np.maximum(looked, 1)) & ~near
+    near = wide_runs(too_near > 0.4 * np.maximum(looked, 1), NEAR_BINS)
+    unknown = (matched < 0.35 * looked) & ~near | (looked == 0)
 
     first = np.where(occupied.any(axis=1), RANGE_EDGES_M[np.argmax(occupied, axis=1)], np.inf)
     first = np.where(near, np.minimum(first, depth.near_limit_m), first)
     unknown &= ~np.isfinite(first)
-    azimuth = centre_rad + (np.arange(bins) + 0.5) * (2 * half_rad / bins) - half_rad
+    azimuth: Floats = centre_rad + (np.arange(bins, dtype=np.float64) + 0.5) * (2 * half_rad / bins) - half_rad
     origin = (float(T[0, 3]), float(T[1, 3]))
     return ObstacleProfile(
         t_ns=depth.t_ns,
@@ -115,6 +121,15 @@ def obstacle_profile(view: View, band_m: float, trust_m: float, bin_rad: float =
         trust_m=trust_m,
         near_limit_m=depth.near_limit_m,
     )
+
+
+def wide_runs(flags: NDArray[np.bool_], least: int) -> NDArray[np.bool_]:
+    """Keep runs of at least `least` set bins (B,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    kept = np.zeros_like(flags)
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        kept[start:end] = end - start >= least
+    return kept
 
 
 def _wrapped(angle_rad: Floats) -> Floats:
@@ -137,7 +152,7 @@ def _smoothed(counts: Floats) -> Floats:
 
 
 def _support_needed(pinhole: Pinhole, stride: int, band_m: float, bin_rad: float) -> Floats:
-    """Pixels (CELLS,) that make an obstacle: a fifth of what a surface filling bin and band would give, at least 2."""
+    """Pixels (CELLS,) that make an obstacle: a fifth of a surface that fills bin and band, at least 2."""
     rows = pinhole.f_px * 2 * band_m / RANGE_EDGES_M[:-1] / stride
     rows = np.minimum(rows, pinhole.height / stride)
     columns = max(1.0, bin_rad * pinhole.f_px / stride)

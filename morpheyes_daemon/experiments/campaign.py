@@ -1,0 +1,221 @@
+"""Many flights: every seed at every baseline, on one machine or on a Dask scheduler, resumable.
+
+Each finished flight is one line of `flights.jsonl`; a campaign started again in the same folder flies only what is
+missing. Flights are independent and indexed by seed, so the order in which they end does not matter.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from morpheyes_daemon.errors import InputError, UsageError
+from morpheyes_daemon.experiments.flight import FlightPlan, fly
+from morpheyes_daemon.experiments.plan import hold, parse_baseline, with_seed
+
+Row = dict[str, Any]
+FLIGHTS = "flights.jsonl"
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """What is flown: `plan` with every baseline ('variable' or metres as text) and every seed."""
+
+    plan: FlightPlan
+    baselines: tuple[str, ...]
+    seeds: tuple[int, ...]
+
+    @property
+    def key(self) -> str:
+        """Hash of everything but seeds and baselines: rows of another key belong to another campaign."""
+        plan = self.plan
+        parts = (
+            plan.mission_name,
+            plan.mission.model_dump_json(),
+            plan.config.model_dump_json(),
+            hashlib.sha256(plan.calibration.read_bytes()).hexdigest(),
+            repr(replace(plan.scenario, seed=0)),
+            repr(plan.limit_s),
+        )
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of '0-39' (inclusive) or '7'; raises UsageError."""
+    first, dash, last = text.partition("-")
+    if first.isdigit() and (last.isdigit() if dash else True):
+        low, high = int(first), int(last) if dash else int(first)
+        if low <= high:
+            return tuple(range(low, high + 1))
+    raise UsageError(f"--seeds {text}: give one seed or a range such as 0-39 (both ends are flown).")
+
+
+def run_campaign(
+    campaign: Campaign, folder: Path, jobs: int, scheduler: str | None, done: Callable[[Row, int, int], None]
+) -> list[Row]:
+    """Fly what is missing and return every row in the order of baselines and seeds.
+
+    `done` hears of each new row, with how many there are of how many. Raises InputError when the folder belongs to
+    another campaign or one is running there, UsageError when the scheduler cannot be reached.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with _lock(folder):
+        rows = {(row["baseline_mode"], row["seed"]): row for row in _read(folder / FLIGHTS, campaign.key)}
+        wanted = [(_mode(text), seed) for text in campaign.baselines for seed in campaign.seeds]
+        missing = [pair for pair in wanted if pair not in rows]
+        total, have = len(wanted), len(wanted) - len(missing)
+        with (folder / FLIGHTS).open("a", encoding="utf-8") as file:
+            for row in _fly_all(campaign, missing, jobs, scheduler):
+                rows[row["baseline_mode"], row["seed"]] = row
+                file.write(json.dumps(row) + "\n")
+                file.flush()
+                have += 1
+                done(row, have, total)
+    return [rows[pair] for pair in wanted]
+
+
+def cells(rows: Sequence[Row]) -> list[Row]:
+    """Return one row per baseline: counts, success rate with its 95 % Wilson interval, speeds, clearance."""
+    modes = list(dict.fromkeys(row["baseline_mode"] for row in rows))
+    variable = {row["seed"]: row for row in rows if row["baseline_mode"] == "variable"}
+    return [_cell(mode, [row for row in rows if row["baseline_mode"] == mode], variable) for mode in modes]
+
+
+def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
+    """Return the Wilson score interval of a success rate; (0, 1) without trials."""
+    if trials == 0:
+        return 0.0, 1.0
+    p, n = successes / trials, trials
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def fly_one(plan: FlightPlan, key: str) -> Row:
+    """Fly one plan and return its row; runs in a worker process."""
+    return {**fly(plan).as_json(), "campaign": key}
+
+
+def _cell(mode: str, rows: Sequence[Row], variable: dict[int, Row]) -> Row:
+    good = [row for row in rows if row["outcome"] == "reached"]
+    low, high = wilson(len(good), len(rows))
+    others = ("collided", "refused", "timeout", "aborted")
+    count = {name: sum(row["outcome"] == name for row in rows) for name in others}
+    causes: dict[str, int] = {}
+    for row in rows:
+        if row["outcome"] != "reached":
+            cause = f"{row['outcome']}: {row['reason']}" if row["outcome"] != "collided" else "collided"
+            causes[cause] = causes.get(cause, 0) + 1
+    return {
+        "baseline_mode": mode,
+        "flights": len(rows),
+        "reached": len(good),
+        **count,
+        "success_rate": round(len(good) / len(rows), 4) if rows else 0.0,
+        "success_low": round(low, 4),
+        "success_high": round(high, 4),
+        "mean_speed_m_s": _mean(good, "mean_speed_m_s"),
+        "peak_speed_m_s": max((row["peak_speed_m_s"] for row in rows), default=None),
+        "mean_time_s": _mean(good, "time_s"),
+        "min_clearance_m": min((row["min_clearance_m"] for row in rows), default=None),
+        "braking_events": sum(row["braking_events"] for row in rows),
+        "speed_ratio_to_variable": _ratio(good, variable),
+        "causes": causes,
+    }
+
+
+def _mean(rows: Sequence[Row], key: str) -> float | None:
+    return round(sum(row[key] for row in rows) / len(rows), 4) if rows else None
+
+
+def _ratio(rows: Sequence[Row], variable: dict[int, Row]) -> list[float] | None:
+    """Variable speed over this baseline's, flight by flight of the same seed: mean and its 95 % interval."""
+    pairs = [
+        variable[row["seed"]]["mean_speed_m_s"] / row["mean_speed_m_s"]
+        for row in rows
+        if row["seed"] in variable and variable[row["seed"]]["outcome"] == "reached"
+    ]
+    if not pairs:
+        return None
+    mean = sum(pairs) / len(pairs)
+    spread = math.sqrt(sum((x - mean) ** 2 for x in pairs) / max(1, len(pairs) - 1))
+    half = 1.96 * spread / math.sqrt(len(pairs))
+    return [round(mean, 3), round(mean - half, 3), round(mean + half, 3)]
+
+
+def _mode(text: str) -> str:
+    metres = parse_baseline(text)
+    return "variable" if metres is None else f"{metres:g}"
+
+
+def _plan(campaign: Campaign, mode: str, seed: int) -> FlightPlan:
+    plan = with_seed(campaign.plan, seed)
+    return replace(plan, config=hold(plan.config, parse_baseline(mode)))
+
+
+def _fly_all(
+    campaign: Campaign, pairs: Sequence[tuple[str, int]], jobs: int, scheduler: str | None
+) -> Iterator[Row]:
+    import joblib
+
+    calls = [joblib.delayed(fly_one)(_plan(campaign, mode, seed), campaign.key) for mode, seed in pairs]
+    if not calls:
+        return
+    with _backend(scheduler):
+        count = -1 if scheduler else jobs
+        yield from joblib.Parallel(n_jobs=count, return_as="generator_unordered")(calls)
+
+
+@contextlib.contextmanager
+def _backend(scheduler: str | None) -> Iterator[None]:
+    if scheduler is None:
+        yield
+        return
+    import joblib
+
+    try:
+        from distributed import Client
+    except ImportError:
+        raise UsageError("--scheduler needs the campaign extra: pip install 'morpheyes-daemon[campaign]'.") from None
+    try:
+        client: Any = Client(scheduler, timeout="10s")  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error}).") from None
+    with client, joblib.parallel_config("dask"):
+        yield
+
+
+@contextlib.contextmanager
+def _lock(folder: Path) -> Iterator[None]:
+    with (folder / "campaign.lock").open("w", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(f"{folder}: another campaign is running there; give another --out.") from None
+        yield
+
+
+def _read(path: Path, key: str) -> list[Row]:
+    """Rows already flown; a last line that was cut off is dropped. Raises InputError on another campaign's rows."""
+    if not path.is_file():
+        return []
+    rows: list[Row] = []
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for number, line in enumerate(lines):
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            if number + 1 < len(lines):
+                raise InputError(f"{path}:{number + 1}: is not a flight; give another --out.") from None
+    if any(row.get("campaign") != key for row in rows):
+        raise InputError(f"{path.parent}: holds flights of another campaign; give another --out.")
+    whole = "".join(json.dumps(row) + "\n" for row in rows)
+    path.write_text(whole, encoding="utf-8")
+    return rows
