@@ -134,8 +134,8 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     began_ns = clock.now_ns()
     topics, events = Topics.create(), EventLog()
     stage = Stage(plan.scenario, plan.config, clock, plan.render_threads)
-    crew = _crew(stage)
-    opener = _memory_opener(stage)
+    crew = make_crew(stage)
+    opener = memory_opener(stage)
     pipeline = PipelineFactory(plan.config, plan.mission, plan.calibration)()
     latency_ns = round(plan.config.stereo.latency_ms * S / 1e3)
     parts = Parts(
@@ -256,7 +256,8 @@ def summarize_flight(
     )
 
 
-def _crew(stage: Stage) -> GroundCrew:
+def make_crew(stage: Stage) -> GroundCrew:
+    """Return a ground crew with an in-memory link of its own."""
     ours, theirs = MemoryLink.pair(LINK_DELAY_S)
     crew = GroundCrew(stage.radio, ours, stage.clock)
     ours.on_bytes = crew.on_bytes
@@ -264,7 +265,8 @@ def _crew(stage: Stage) -> GroundCrew:
     return crew
 
 
-def _memory_opener(stage: Stage) -> LinkOpener:
+def memory_opener(stage: Stage) -> LinkOpener:
+    """Return what opens the daemon's links to the autopilot and the Teensy of `stage`."""
     async def open_memory(url: str, on_bytes: OnBytes, on_lost: OnLost) -> Link:
         ours, theirs = MemoryLink.pair(LINK_DELAY_S)
         ours.on_bytes, ours.on_lost = on_bytes, on_lost
