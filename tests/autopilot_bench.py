@@ -75,7 +75,7 @@ class AutopilotBench:
         receiver: bool = True,
         noise: EstimatorNoise = NOISELESS,
         seed: int = 0,
-        ready_after_s: float = 1.0,
+        ready_after_s: float = 0.1,
         old_names: bool = False,
     ) -> None:
         self.clock = HandClock()
@@ -123,7 +123,8 @@ class AutopilotBench:
 
     def take_off(self, height_m: float = 3.0) -> None:
         """Arm and climb in Loiter by overrides, and centre the receiver's sticks."""
-        self.hold(1.5, 1500, 1500, 1000, 1500)
+        while not self.twin.autopilot.estimator.has_position:
+            self.hold(0.1, 1500, 1500, 1000, 1500)
         if self.twin.parameters.flow_only:
             self.station.send(mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0))
         assert self.station.command(mavlink.MAV_CMD_DO_SET_MODE, 1, Mode.LOITER) == 0, self.texts
@@ -133,7 +134,7 @@ class AutopilotBench:
             self.hold(0.1, 1500, 1500, 1800, 1500)
         while self.truth.height_m < height_m - 0.04:
             self.hold(0.1, 1500, 1500, 1620, 1500)
-        self.hold(2.0, *NEUTRAL)
+        self.hold(1.0, *NEUTRAL)
 
     def forward(self, pitch_us: int, seconds: float) -> None:
         """Hold the pitch stick."""

@@ -97,9 +97,9 @@ class Autopilot:
         return self.control.armed
 
     @property
-    def estimator_failed(self) -> bool:
-        """An EKF failsafe is on."""
-        return self._ekf_failed
+    def in_failsafe(self) -> bool:
+        """A failsafe of radio, EKF, battery or ground station is on."""
+        return self.rc.failsafe or self._ekf_failed or self.battery.low or self._gcs_lost
 
     @property
     def ready_to_arm(self) -> bool:

@@ -55,7 +55,7 @@ def heartbeat(autopilot: Autopilot) -> Message:
 
 
 def _state(autopilot: Autopilot) -> int:
-    if autopilot.rc.failsafe or autopilot.estimator_failed:
+    if autopilot.in_failsafe:
         return int(mavlink.MAV_STATE_CRITICAL)
     return int(mavlink.MAV_STATE_STANDBY if autopilot.control.landed else mavlink.MAV_STATE_ACTIVE)
 
@@ -199,7 +199,6 @@ def _autopilot_version(autopilot: Autopilot) -> Message:
         mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
         | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
         | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-        | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
     )
     git = list(b"twin0000")
     return mavlink.MAVLink_autopilot_version_message(capabilities, _FIRMWARE, 0, 0, 0, git, git, git, 0, 0, 1)

@@ -27,7 +27,7 @@ _BOOT_NS = 2 * S
 """How long the links are silent after a reboot."""
 
 _MOST_TICKS_AT_ONCE = 100
-"""After a longer hold-up in real time the rest is skipped."""
+"""A longer hold-up in real time is caught up in pieces, so that links are served in between."""
 
 
 class AutopilotTwin:

@@ -215,7 +215,7 @@ class FlightControl:
             return self._stick_lean(pilot, self.settings.angle_rad)
         if not self.dead_reckons or (self._blind and self.mode is Mode.LAND):
             return 0.0, 0.0
-        heading = math.cos(self._vehicle.yaw_rad), math.sin(self._vehicle.yaw_rad)
+        heading = self._vehicle.heading
         return self._follow(self._reference(pilot, heading), heading)
 
     def _reference(self, pilot: PilotInput, heading: tuple[float, float]) -> Reference:

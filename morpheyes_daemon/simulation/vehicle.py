@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import random
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +22,8 @@ from morpheyes_daemon.transforms import R_from_rpy, pose, wrap_rad
 STEP_NS = 2_500_000
 STEP_S = STEP_NS / 1e9
 HISTORY_S = 4.0
-AHEAD_NS = 50_000_000
+_ROWS_KEPT = round(HISTORY_S / STEP_S)
+AHEAD_NS = 100_000_000
 """How far past the newest step the truth may be extrapolated."""
 
 _STEPS_PER_GUST = 4
@@ -81,7 +81,8 @@ class Truth:
         return -self.p_ned_m[2]
 
 
-_Row = tuple[float, float, float, float, float, float, float, float, float]
+_Row = tuple[float, ...]
+"""Position, velocity, lean forward and right, yaw, shiver of roll, pitch and yaw: what a step leaves behind."""
 
 
 class Vehicle:
@@ -102,6 +103,7 @@ class Vehicle:
         self.north_m, self.east_m, self.down_m = start_ned_m[0], start_ned_m[1], 0.0
         self.v_north_m_s = self.v_east_m_s = self.v_down_m_s = 0.0
         self.yaw_rad = yaw_rad
+        self.heading = math.cos(yaw_rad), math.sin(yaw_rad)
         self.yaw_rate_rad_s = 0.0
         self.on_ground = True
         self._forward = SecondOrder(LEAN_LAG_S)
@@ -112,12 +114,14 @@ class Vehicle:
         self._keep = math.exp(-_STEPS_PER_SHIVER * STEP_S / _SHIVER_TAU_S)
         self._kick = self.airframe.shiver_rad * math.sqrt(1.0 - self._keep**2)
         self._count = 0
-        self._history: deque[_Row] = deque(maxlen=round(HISTORY_S / STEP_S))
+        self._newest = 0
+        self._start_ns = 0
+        self._rows: dict[int, _Row] = {}
         self._record()
 
     def start_at(self, t_ns: int) -> None:
         """Set the time of the present state, before the first step."""
-        self.t_ns = t_ns
+        self._start_ns = self.t_ns = t_ns
 
     @property
     def height_m(self) -> float:
@@ -134,7 +138,7 @@ class Vehicle:
         """Acceleration that the present lean gives, north and east."""
         forward = GRAVITY_M_S2 * math.tan(self._forward.value)
         right = GRAVITY_M_S2 * math.tan(self._right.value)
-        cos_yaw, sin_yaw = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        cos_yaw, sin_yaw = self.heading
         return forward * cos_yaw - right * sin_yaw, forward * sin_yaw + right * cos_yaw
 
     def step(self) -> None:
@@ -167,6 +171,7 @@ class Vehicle:
             self._shake()
         self.yaw_rate_rad_s += (wanted - self.yaw_rate_rad_s) * STEP_S / _YAW_LAG_S
         self.yaw_rad = wrap_rad(self.yaw_rad + self.yaw_rate_rad_s * STEP_S)
+        self.heading = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
 
     def _shake(self) -> None:
         gauss, shiver = self._random.gauss, self._shiver
@@ -196,28 +201,39 @@ class Vehicle:
             self._rest()
 
     def _record(self) -> None:
+        """Keep what this step left behind; keyed by step, so that a render thread may read meanwhile."""
         position = self.north_m, self.east_m, self.down_m
         velocity = self.v_north_m_s, self.v_east_m_s, self.v_down_m_s
-        self._history.append((*position, *velocity, *self.attitude_rad()))
+        self._rows[self._count] = (*position, *velocity, *self.lean_rad, self.yaw_rad, *self._shiver)
+        self._rows.pop(self._count - _ROWS_KEPT, None)
+        self._newest = self._count
 
     def attitude_rad(self) -> tuple[float, float, float]:
         """Return roll, pitch, yaw of the body, vibration included."""
-        pitch = -self._forward.value
-        roll = math.atan(math.tan(self._right.value) * math.cos(pitch))
-        return roll + self._shiver[0], pitch + self._shiver[1], wrap_rad(self.yaw_rad + self._shiver[2])
+        return _attitude(*self.lean_rad, self.yaw_rad, *self._shiver)
 
     def truth_at(self, t_ns: int) -> Truth:
         """Return the truth at `t_ns`, interpolated, or extrapolated by at most `AHEAD_NS`.
 
         Raises InputError for a time that is no longer, or not yet, known.
         """
-        back = (self.t_ns - t_ns) / STEP_NS
-        oldest = len(self._history) - 1
-        if back < -AHEAD_NS / STEP_NS or (back > oldest and len(self._history) == self._history.maxlen):
+        newest = self._newest
+        steps = (t_ns - self._start_ns) / STEP_NS
+        if 0 in self._rows:
+            steps = max(steps, 0.0)  # before its first step the vehicle stood where it started
+        index = min(math.floor(steps), newest - 1)
+        before, after = self._rows.get(index), self._rows.get(index + 1)
+        if steps > newest + AHEAD_NS / STEP_NS or after is None:
             raise InputError(f"the truth at {t_ns} ns is not known; the newest is of {self.t_ns} ns.")
-        index = max(0, min(oldest - 1, math.floor(oldest - back)))
-        part = max(oldest - back - index, 0.0) if oldest > 0 else 0.0
-        a, b = self._history[index], self._history[min(index + 1, oldest)]
+        a, b, part = before or after, after, steps - index
         mix = [x + (y - x) * part for x, y in zip(a, b, strict=True)]
-        yaw = wrap_rad(a[8] + wrap_rad(b[8] - a[8]) * part)
-        return Truth(t_ns, (mix[0], mix[1], mix[2]), (mix[3], mix[4], mix[5]), mix[6], mix[7], yaw)
+        mix[8] = a[8] + wrap_rad(b[8] - a[8]) * part
+        return Truth(t_ns, (mix[0], mix[1], mix[2]), (mix[3], mix[4], mix[5]), *_attitude(*mix[6:]))
+
+
+def _attitude(
+    forward_rad: float, right_rad: float, yaw_rad: float, d_roll: float, d_pitch: float, d_yaw: float
+) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw of a thrust that leans forward and right, shaken by the last three."""
+    roll = math.atan(math.tan(right_rad) * math.cos(forward_rad))
+    return roll + d_roll, -forward_rad + d_pitch, wrap_rad(yaw_rad + d_yaw)
