@@ -13,7 +13,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.clock import Clock, S, Ticker
+from morpheyes_daemon.clock import MS, Clock, S, Ticker
 from morpheyes_daemon.simulation.autopilot_commands import Commands
 from morpheyes_daemon.simulation.autopilot_core import TICK_NS, Autopilot, Severity
 from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED, ParameterTable
@@ -189,7 +189,7 @@ class AutopilotTwin:
     def reboot(self) -> None:
         """Restart the autopilot: motors stop, links are silent for a while, rates and estimate are gone."""
         self.autopilot.boot(self.autopilot.t_ns)
-        self._up_ns = self.autopilot.t_ns + _BOOT_NS
+        self._up_ns = self.autopilot.t_ns + _BOOT_NS + round(self.parameters["BRD_BOOT_DELAY"] * MS)
         for port in self._ports.values():
             port.forget()
 

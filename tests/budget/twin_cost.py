@@ -1,4 +1,4 @@
-"""What the vehicle and autopilot twin cost: `python -m tests.budget.twin_cost` prints shares of one core in real time.
+"""What vehicle and autopilot twin cost: `python -m tests.budget.twin_cost` prints shares of one core in real time.
 
 Telemetry as the daemon asks for it: attitude, velocity and RC at 50 Hz, range at 20 Hz, health at 5 Hz.
 """
