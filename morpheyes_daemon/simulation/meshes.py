@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,9 @@ def frustum(base: Array, top: Array, radius_base_m: float, radius_top_m: float, 
     return vertices, uv, np.concatenate([ring, ring]), quads.astype(np.int32)
 
 
+@lru_cache
 def icosphere(subdivisions: int) -> tuple[Array, Triangles]:
-    """Return unit vertices (V, 3) and triangles of a subdivided icosahedron."""
+    """Return unit vertices (V, 3) and triangles of a subdivided icosahedron; read-only, a forest asks thousandfold."""
     phi = (1.0 + math.sqrt(5.0)) / 2.0
     corners = [(s * 1.0, t * phi, 0.0) for s in (-1, 1) for t in (-1, 1)]
     points = [np.roll(c, k) for k in range(3) for c in corners]
@@ -45,6 +47,7 @@ def icosphere(subdivisions: int) -> tuple[Array, Triangles]:
     triangles = _hull_of_icosahedron(vertices)
     for _ in range(subdivisions):
         vertices, triangles = _subdivide(vertices, triangles)
+    vertices.flags.writeable = triangles.flags.writeable = False
     return vertices, triangles
 
 
