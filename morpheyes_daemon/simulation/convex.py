@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.simulation.kernel import kernel
+from morpheyes_daemon.simulation.kernel import allocating
 
 FRUSTUM, CYLINDER, ELLIPSOID, BOX, PRISM = range(5)
 """Kinds of solid; what `size` (7,) means in the solid's own frame, centred at the origin:
@@ -25,7 +25,7 @@ TOLERANCE_M = 2e-5
 MAX_ITERATIONS = 200
 
 
-@kernel
+@allocating
 def _support_local(kind: int, size: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return the point of the solid that is farthest along (x, y, z), in its own frame."""
     if kind == FRUSTUM:
@@ -54,7 +54,7 @@ def _support_local(kind: int, size: Any, x: float, y: float, z: float) -> tuple[
     return size[2 * best], size[2 * best + 1], math.copysign(size[6], z)
 
 
-@kernel
+@allocating
 def _support(kind: int, frame: Any, size: Any, d: Any, sign: float, out: Any) -> None:
     """Add `sign` times the support point along sign * d to `out`; frame (3, 4) is rotation and centre."""
     x, y, z = sign * d[0], sign * d[1], sign * d[2]
@@ -66,7 +66,7 @@ def _support(kind: int, frame: Any, size: Any, d: Any, sign: float, out: Any) ->
         out[i] += sign * (frame[i, 0] * px + frame[i, 1] * py + frame[i, 2] * pz + frame[i, 3])
 
 
-@kernel
+@allocating
 def _difference(kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: Any, size_b: Any, d: Any, out: Any) -> None:
     """Write the support point of A - B along d."""
     out[:] = 0.0
@@ -74,12 +74,12 @@ def _difference(kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: An
     _support(kind_b, frame_b, size_b, d, -1.0, out)
 
 
-@kernel
+@allocating
 def _dot(a: Any, b: Any) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@kernel
+@allocating
 def _closest_on_segment(s: Any, i: int, j: int, weights: Any) -> None:
     a, ab = s[i], s[j] - s[i]
     length2 = _dot(ab, ab)
@@ -89,7 +89,7 @@ def _closest_on_segment(s: Any, i: int, j: int, weights: Any) -> None:
     weights[i], weights[j] = 1.0 - t, t
 
 
-@kernel
+@allocating
 def _closest_on_triangle(s: Any, i: int, j: int, k: int, weights: Any) -> None:
     """Barycentric weights of the triangle's point nearest to the origin (Ericson 5.1.5)."""
     a, b, c = s[i], s[j], s[k]
@@ -116,7 +116,7 @@ def _closest_on_triangle(s: Any, i: int, j: int, k: int, weights: Any) -> None:
         weights[i], weights[j], weights[k] = va / total, vb / total, vc / total
 
 
-@kernel
+@allocating
 def _closest_on_tetrahedron(s: Any, weights: Any) -> bool:
     """Nearest point of a tetrahedron to the origin; True when the origin is inside."""
     faces = ((0, 1, 2, 3), (0, 1, 3, 2), (0, 2, 3, 1), (1, 2, 3, 0))
@@ -141,7 +141,7 @@ def _closest_on_tetrahedron(s: Any, weights: Any) -> bool:
     return not outside
 
 
-@kernel
+@allocating
 def _overlap(
     kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: Any, size_b: Any, directions: Any
 ) -> float:
@@ -154,7 +154,7 @@ def _overlap(
     return max(best, 0.0)
 
 
-@kernel
+@allocating
 def distance(
     kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: Any, size_b: Any, directions: Any
 ) -> float:
@@ -203,7 +203,7 @@ def distance(
     return length
 
 
-@kernel
+@allocating
 def nearest(
     kinds: Any, frames: Any, sizes: Any, kind_b: int, frame_b: Any, size_b: Any, reach_b: float,
     capsules: Any, best: float, directions: Any,

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.simulation.kernel import kernel
+from morpheyes_daemon.simulation.kernel import inlined, kernel
 
 NOISE: NDArray[np.float32] = np.random.default_rng(4711).standard_normal(1 << 18, dtype=np.float32)
 """Unit normal numbers; a power of two of them."""
 
 
-@kernel
+@inlined
 def _hashed(key: Any, row: int) -> int:
     """Return a well mixed non-negative number (splitmix64)."""
     z = key * np.uint64(0x9E3779B97F4A7C15) + np.uint64(row) * np.uint64(0xD1B54A32D192ED03)
@@ -27,7 +27,7 @@ def _hashed(key: Any, row: int) -> int:
     return int((z ^ (z >> np.uint64(31))) >> np.uint64(33))
 
 
-@kernel
+@inlined
 def _cubic(t: Any) -> tuple[Any, Any, Any, Any]:
     """Catmull-Rom weights of the four neighbours at fraction t."""
     half = np.float32(0.5)

@@ -18,13 +18,14 @@ from pydantic import Field
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.simulation import meshes, textures
 from morpheyes_daemon.simulation.scene import GROUND_OBJECT, SKY_OBJECT, Bgr, Light, Material, Mesh, Scene
-
-Array = NDArray[np.float64]
+from morpheyes_daemon.simulation.species import BROADLEAVES, CONIFERS, Layer, Species, broadleaf, conifer
+from morpheyes_daemon.transforms import Array
 
 LIGHT_MAP_PX = 2048
 FAR_GROUND_M = 600.0
 
-NEAR, MIDDLE, FAR = (0.0, 16.0), (16.0, 42.0), (42.0, 130.0)
+RANGES = ((0.0, 16.0), (16.0, 40.0), (40.0, 110.0))
+"""Distances in metres at which the levels of detail are drawn."""
 
 
 class ForestWorld(Section):
@@ -46,19 +47,40 @@ class ForestWorld(Section):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tree:
-    """A tapered trunk from `base` to `top` (ned) and what it carries."""
+    """A tapered trunk from `base` to `top` (ned) and the foliage it carries, turned about the trunk."""
 
     base: Array
     top: Array
     radius_m: float
     top_radius_m: float
+    species: Species
     conifer: bool
-    seed: int
+    width_m: float
+    turn_rad: float
+    bark: str
+    tone: float
+    tint: Bgr
 
     @property
     def height_m(self) -> float:
         """Length of the trunk."""
         return float(np.linalg.norm(self.top - self.base))
+
+    def radius_at_m(self, height_m: float) -> float:
+        """Return the trunk's radius at a height above its base."""
+        return self.radius_m + height_m / self.height_m * (self.top_radius_m - self.radius_m)
+
+    def placed(self, unit: Array) -> Array:
+        """Return unit-space points (n, 3) of the species in ned: turned, widened, carried along the trunk."""
+        c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
+        M = np.stack([self.width_m * np.array([c, s, 0.0]), self.width_m * np.array([-s, c, 0.0]), self.top - self.base])
+        return np.asarray(self.base + unit @ M)
+
+    def crowns(self) -> list[tuple[Array, Array]]:
+        """Return the ellipsoids of foliage: centre (ned) and radii (across, across, up)."""
+        centres = self.placed(self.species.crowns[:, :3])
+        radii = self.species.crowns[:, 3:] * (self.width_m, self.width_m, self.height_m)
+        return list(zip(centres, radii, strict=True))
 
 
 def plant(world: ForestWorld, seed: int) -> list[Tree]:
@@ -81,47 +103,29 @@ def plant(world: ForestWorld, seed: int) -> list[Tree]:
         from_ends = min(math.hypot(x, y), math.hypot(x - world.course_m, y)) - radius
         if free and from_ends >= world.clearing_m:
             places[len(trees)] = x, y, radius
-            trees.append(_grow(rng, world, x, y, radius, lean_rad, seed=len(trees)))
+            trees.append(_grow(rng, world, x, y, radius, lean_rad))
     return trees
 
 
-def _grow(
-    rng: np.random.Generator, world: ForestWorld, x: float, y: float, radius: float, lean_rad: float, seed: int
-) -> Tree:
+def _grow(rng: np.random.Generator, world: ForestWorld, x: float, y: float, radius: float, lean_rad: float) -> Tree:
     height = rng.uniform(9.0, 13.0) + 14.0 * radius
     lean, towards = lean_rad * math.sqrt(rng.random()), rng.uniform(0, 2 * math.pi)
     tilt = np.array([math.sin(lean) * math.cos(towards), math.sin(lean) * math.sin(towards), -math.cos(lean)])
     base = np.array([x, y, 0.0])
-    return Tree(base, base + height * tilt, radius, 0.25 * radius, bool(rng.random() < world.conifers), seed)
+    is_conifer = bool(rng.random() < world.conifers)
+    number = int(rng.integers(0, 1 << 30))
+    green = rng.uniform(0.55, 0.9) * np.array([0.8, 0.85, 0.6]) if is_conifer else _leaf_green(rng)
+    return Tree(
+        base, base + height * tilt, radius, 0.25 * radius,
+        conifer(number % CONIFERS) if is_conifer else broadleaf(number % BROADLEAVES), is_conifer,
+        width_m=1.1 + 3.0 * radius, turn_rad=rng.uniform(0, 2 * math.pi),
+        bark=f"bark{2 if is_conifer else number % 2}", tone=rng.uniform(0.75, 1.2),
+        tint=(float(green[0]), float(green[1]), float(green[2])),
+    )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Crown:
-    """One ellipsoid of foliage with vertical axis: centre (ned) and radii (across, across, up)."""
-
-    centre: Array
-    radii: Array
-
-
-def crowns(tree: Tree) -> list[Crown]:
-    """Return the foliage of a tree; conifers are described by one slender ellipsoid."""
-    rng = np.random.default_rng([tree.seed, 101])
-    up = (tree.top - tree.base) / tree.height_m
-    spread = 1.1 + 3.0 * tree.radius_m
-    if tree.conifer:
-        low = rng.uniform(3.2, 4.6)
-        half = 0.5 * (tree.height_m + 0.8 - low)
-        return [Crown(tree.base + up * (low + half), np.array([spread, spread, half]))]
-    low = rng.uniform(4.2, 6.0)
-    found = []
-    for k in range(6):
-        along = rng.uniform(low + 1.0, tree.height_m)
-        angle = 2 * math.pi * (k / 6 + 0.1 * rng.random())
-        out = spread * rng.uniform(0.35, 0.9) * (1.0 if k else 0.0)
-        centre = tree.base + up * along + np.array([out * math.cos(angle), out * math.sin(angle), 0.0])
-        width = spread * rng.uniform(0.6, 0.9)
-        found.append(Crown(centre, np.array([width, width, min(0.7 * width, along - low + 0.6)])))
-    return found
+def _leaf_green(rng: np.random.Generator) -> Array:
+    return np.asarray(np.array([0.75, 1.0, 0.95]) * rng.uniform(0.7, 1.25, 3) * rng.uniform(0.8, 1.2))
 
 
 def build_scene(world: ForestWorld, seed: int) -> tuple[Scene, list[Tree]]:
@@ -163,83 +167,36 @@ def ground(world: ForestWorld) -> Mesh:
     """Return the ground plane; its texture coordinates start at the corner of the planted area."""
     end = np.array([-FAR_GROUND_M, FAR_GROUND_M])
     vertices, uv, _, triangles = meshes.terrain(end, end, np.zeros((2, 2)))
-    uv = uv + (world.run_in_m, world.half_width_m)
+    uv = uv + np.array([world.run_in_m, world.half_width_m])
     return Mesh(vertices, uv, np.ones(len(vertices)), triangles, "ground", GROUND_OBJECT)
 
 
 def tree_meshes(tree: Tree, object_id: int, light: Light) -> list[Mesh]:
     """Return trunk and foliage of one tree, coarser for greater distances."""
-    rng = np.random.default_rng([tree.seed, 102])
-    tone, dark = rng.uniform(0.75, 1.2), rng.uniform(0.55, 0.9)
-    tint = np.array([0.75, 1.0, 0.95]) * rng.uniform(0.7, 1.25, 3) * rng.uniform(0.8, 1.2)
-    bark = f"bark{2 if tree.conifer else int(rng.integers(0, 2))}"
-    parts = []
-    for sides, span in ((20, NEAR), (10, (NEAR[1], FAR[1]))):
-        trunk = meshes.frustum(tree.base, tree.top, tree.radius_m, tree.top_radius_m, sides)
-        parts.append(_Part(trunk, bark, (tone, tone, tone), span, shift=7 * rng.random()))
-    if tree.conifer:
-        needles = (0.8 * dark, 0.85 * dark, 0.6 * dark)
-        for tiers, points, span in ((7, 8, NEAR), (6, 5, MIDDLE), (4, 3, FAR)):
-            surface = _needles(rng, tree, tiers, points)
-            parts.append(_Part(surface, "leaves1", needles, span, wrap=0.4, two_sided=True))
-    else:
-        leaves: Bgr = (tint[0], tint[1], tint[2])
-        inner: Bgr = (0.7 * tint[0], 0.7 * tint[1], 0.7 * tint[2])
-        for crown in crowns(tree):
-            body = meshes.blob(rng, crown.centre, 0.85 * crown.radii, 1, 0.25)
-            cards = meshes.leaf_cards(rng, crown.centre, crown.radii, 60, 0.45)
-            parts.append(_Part(body, "leaves0", inner, NEAR, wrap=0.3))
-            parts.append(_Part(cards, "leaves0", leaves, NEAR, wrap=0.5, two_sided=True, loose=True))
-        for subdivisions, span in ((1, MIDDLE), (0, FAR)):
-            blobs = [meshes.blob(rng, c.centre, c.radii, subdivisions, 0.35) for c in crowns(tree)]
-            parts.append(_Part(_joined(blobs), "leaves0", leaves, span, wrap=0.4))
-    return [part.mesh(object_id, light.direction) for part in parts]
+    sun, parts = light.direction, []
+    bark: Bgr = (tree.tone, tree.tone, tree.tone)
+    for sides, span in zip((20, 10, 6), RANGES, strict=True):
+        vertices, uv, normals, triangles = meshes.frustum(
+            tree.base, tree.top, tree.radius_m, tree.top_radius_m, sides
+        )
+        share = np.clip(normals @ sun, 0.0, 1.0)
+        uv = uv + 7.0 * tree.turn_rad
+        parts.append(Mesh(vertices, uv, share, triangles, tree.bark, object_id, bark, draw_range_m=span))
+    return parts + [_foliage(tree, layer, object_id, sun) for layer in tree.species.layers]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """A surface with its looks; `wrap` lets sun reach around, as it does through leaves."""
-
-    surface: meshes.Surface
-    material: str
-    tint: Bgr
-    draw_range_m: tuple[float, float]
-    shift: float = 0.0
-    wrap: float = 0.0
-    two_sided: bool = False
-    loose: bool = False
-
-    def mesh(self, object_id: int, sun: Array) -> Mesh:
-        vertices, uv, normals, triangles = self.surface
-        share = np.clip((normals @ sun + self.wrap) / (1.0 + self.wrap), 0.0, 1.0)
-        return Mesh(
-            vertices, uv + self.shift, share, triangles, self.material, object_id, self.tint, 1.0,
-            self.two_sided, self.loose, self.draw_range_m,
-        )  # fmt: skip
-
-
-def _needles(rng: np.random.Generator, tree: Tree, tiers: int, points: int) -> meshes.Surface:
-    """Return the tiers of a conifer, narrowing upwards around the trunk's axis."""
-    crown = crowns(tree)[0]
-    low, height = crown.centre[2] + crown.radii[2], 2 * crown.radii[2]
-    surfaces = []
-    for k in range(tiers):
-        share = k / tiers
-        along = (tree.base[2] - (low - share * height)) / (tree.base[2] - tree.top[2])
-        base = tree.base + along * (tree.top - tree.base)
-        width = crown.radii[0] * (1.0 - 0.8 * share)
-        surfaces.append(meshes.cone_tier(rng, base, height / tiers * 1.7, width, points))
-    return _joined(surfaces)
-
-
-def _joined(surfaces: list[meshes.Surface]) -> meshes.Surface:
-    starts = np.cumsum([0, *(len(s[0]) for s in surfaces)])
-    return (
-        np.concatenate([s[0] for s in surfaces]),
-        np.concatenate([s[1] for s in surfaces]),
-        np.concatenate([s[2] for s in surfaces]),
-        np.concatenate([s[3] + start for s, start in zip(surfaces, starts, strict=False)]).astype(np.int32),
-    )
+def _foliage(tree: Tree, layer: Layer, object_id: int, sun: Array) -> Mesh:
+    """Set one layer of the species on the tree; sun reaches around leaves."""
+    vertices, uv, normals, triangles = layer.surface
+    c, s = math.cos(tree.turn_rad), math.sin(tree.turn_rad)
+    sun_unit = np.array([c * sun[0] + s * sun[1], c * sun[1] - s * sun[0], sun[2]])
+    share = np.clip((normals @ sun_unit + 0.45) / 1.45, 0.0, 1.0)
+    depth = 0.7 if layer.dark else 1.0
+    tint: Bgr = (depth * tree.tint[0], depth * tree.tint[1], depth * tree.tint[2])
+    return Mesh(
+        tree.placed(vertices), uv * tree.width_m, share, triangles, "leaves1" if tree.conifer else "leaves0",
+        object_id, tint, 1.0, layer.two_sided, layer.loose, RANGES[layer.level],
+    )  # fmt: skip
 
 
 def light_map(world: ForestWorld, trees: list[Tree], light: Light, seed: int) -> textures.Texture:
@@ -259,18 +216,24 @@ def light_map(world: ForestWorld, trees: list[Tree], light: Light, seed: int) ->
     for tree in trees:
         a, b = pixel(tree.base), pixel(tree.top)
         side = np.array([-slide[1], slide[0]]) / np.hypot(*slide) * scale
-        corners = [a + tree.radius_m * side, a - tree.radius_m * side, b - tree.top_radius_m * side, b + tree.top_radius_m * side]
-        cv2.fillConvexPoly(trunks, np.rint(16 * np.array(corners)).astype(np.int32), 255, cv2.LINE_AA, 4)
-        for crown in crowns(tree):
-            along = math.hypot(crown.radii[0], crown.radii[2] * float(np.hypot(*slide)))
-            axes = np.rint(16 * np.array([along, crown.radii[1]]) * scale.mean()).astype(int)
-            centre = np.rint(16 * pixel(crown.centre)).astype(int)
+        low, high = tree.radius_m * side, tree.top_radius_m * side
+        corners = np.rint(16 * np.array([a + low, a - low, b - high, b + high]))
+        cv2.fillConvexPoly(trunks, corners.astype(np.int32), 255, cv2.LINE_AA, 4)
+        for crown, radii in tree.crowns():
+            along = math.hypot(radii[0], radii[2] * float(np.hypot(*slide)))
+            axes = np.rint(16 * np.array([along, radii[1]]) * scale.mean()).astype(int)
+            centre = np.rint(16 * pixel(crown)).astype(int)
             angle = math.degrees(math.atan2(slide[1], slide[0]))
             cv2.ellipse(foliage, centre.tolist(), axes.tolist(), angle, 0, 360, 255, -1, cv2.LINE_AA, 4)
-    leafy = np.clip(0.6 + 0.55 * textures.noise(rng, n, slope=1.2), 0, 1)
-    dark = 0.9 * cv2.GaussianBlur(foliage, (0, 0), 5).astype(np.float64) / 255 * leafy
-    sunny = (1.0 - dark) * (1.0 - 0.92 * cv2.GaussianBlur(trunks, (0, 0), 1.2).astype(np.float64) / 255)
-    patches = textures.noise(rng, n, slope=1.5)
-    dry = textures.noise(rng, n, slope=1.4)
+    leafy = _field(rng, n, n // 2, 1.2)
+    dark = np.float32(0.9 / 255) * cv2.GaussianBlur(foliage, (0, 0), 5) * np.clip(0.6 + 0.55 * leafy, 0, 1)
+    sunny = (1 - dark) * (1 - np.float32(0.92 / 255) * cv2.GaussianBlur(trunks, (0, 0), 1.2))
+    patches, dry = _field(rng, n, n // 8, 1.5), _field(rng, n, n // 8, 1.4)
     tone = np.stack([128 - 6 * dry, 128 + 7 * patches, 128 + 10 * dry + 3 * patches], axis=-1)
     return textures.finished(tone, 255 * sunny)
+
+
+def _field(rng: np.random.Generator, size: int, detail: int, slope: float) -> NDArray[np.float32]:
+    """Return noise made at `detail` px and enlarged."""
+    small = textures.noise(rng, detail, slope=slope).astype(np.float32)
+    return np.asarray(cv2.resize(small, (size, size), interpolation=cv2.INTER_CUBIC), dtype=np.float32)

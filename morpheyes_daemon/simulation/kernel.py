@@ -8,17 +8,38 @@ notices only changes of the file that a cached function is in.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
-F = TypeVar("F", bound=Callable[..., object])
+import numba
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 def kernel(function: F) -> F:
-    """Compile `function` on first use; it releases the interpreter lock while it runs."""
-    import numba
+    """Compile `function` on first use; it releases the interpreter lock while it runs.
 
+    It must not allocate: numba's counting of references to arrays is off, since it costs more than the work itself.
+    """
+    return _cached(function, _nrt=False)
+
+
+def allocating(function: F) -> F:
+    """Compile a function that allocates arrays, and does so rarely."""
+    return _cached(function)
+
+
+def inlined(function: F) -> F:
+    """Compile a part of a kernel into its callers."""
+    return _compiled(function, forceinline=True, _nrt=False)
+
+
+def _cached(function: F, **options: bool) -> F:
     try:
-        compiled: F = numba.njit(nogil=True, cache=True)(function)
+        return _compiled(function, cache=True, **options)
     except RuntimeError:  # numba found no place for its cache
-        compiled = numba.njit(nogil=True)(function)
-    return compiled
+        return _compiled(function, **options)
+
+
+def _compiled(function: F, **options: bool) -> F:
+    compiled: Any = numba.njit(nogil=True, **options)(function)
+    return compiled  # type: ignore[no-any-return]

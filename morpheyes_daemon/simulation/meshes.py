@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from morpheyes_daemon.transforms import Array, skew
+
 Triangles = NDArray[np.int32]
 Surface = tuple[Array, Array, Array, Triangles]
 """vertices_m (V, 3), uv_m (V, 2), outward unit normals (V, 3), triangles (T, 3)."""
@@ -22,11 +23,9 @@ def frustum(base: Array, top: Array, radius_base_m: float, radius_top_m: float, 
     axis = top - base
     height = float(np.linalg.norm(axis))
     axis = axis / height
-    across = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
+    across = skew(axis) @ ([1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
-    angle = np.arange(sides + 1) * (2.0 * math.pi / sides)
-    ring = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
-    ring[-1] = ring[0]
+    ring = _circle(sides) @ np.stack([across, skew(axis) @ across])
     grown = 2.0 / (1.0 + math.cos(math.pi / sides))
     vertices = np.concatenate([base + grown * radius_base_m * ring, top + grown * radius_top_m * ring])
     around = max(1.0, round(2.0 * math.pi * max(radius_base_m, radius_top_m))) * np.arange(sides + 1) / sides
@@ -38,6 +37,14 @@ def frustum(base: Array, top: Array, radius_base_m: float, radius_top_m: float, 
 
 
 @lru_cache
+@cache
+def _circle(sides: int) -> Array:
+    """Cosine and sine (sides + 1, 2) once around; the last is the first, to the bit."""
+    angle = np.arange(sides + 1) % sides * (2.0 * math.pi / sides)
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+@cache
 def icosphere(subdivisions: int) -> tuple[Array, Triangles]:
     """Return unit vertices (V, 3) and triangles of a subdivided icosahedron; read-only, a forest asks thousandfold."""
     phi = (1.0 + math.sqrt(5.0)) / 2.0
@@ -152,3 +159,14 @@ def terrain(x_m: Array, y_m: Array, height_m: Array) -> Surface:
     north, east = i + len(y_m), i + 1
     triangles = np.concatenate([np.column_stack([i, east, north]), np.column_stack([east, north + 1, north])])
     return vertices, vertices[:, :2].copy(), normals, triangles.astype(np.int32)
+
+
+def joined(surfaces: list[Surface]) -> Surface:
+    """Return several surfaces as one."""
+    starts = np.cumsum([0, *(len(s[0]) for s in surfaces)])
+    return (
+        np.concatenate([s[0] for s in surfaces]),
+        np.concatenate([s[1] for s in surfaces]),
+        np.concatenate([s[2] for s in surfaces]),
+        np.concatenate([s[3] + start for s, start in zip(surfaces, starts, strict=False)]).astype(np.int32),
+    )

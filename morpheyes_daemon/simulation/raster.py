@@ -1,6 +1,7 @@
 """Which triangle every sample sees: culling, near clipping and scan conversion into a visibility buffer.
 
-Per sample the buffer keeps 1/z and the index of a set-up record, from which `shading` computes everything else.
+Per sample the buffer keeps one number, the bits of 1/z above the index of a set-up record, so that the largest is the
+nearest; from the record `shading` computes everything else.
 Spans are half-open between edge crossings that do not depend on the direction an edge is walked in, so meshes
 that share vertices have neither cracks nor double hits. Plane equations come from the unclipped triangle in
 homogeneous coordinates (Olano and Greer, Triangle Scan Conversion using 2D Homogeneous Coordinates, 1997).
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.simulation.kernel import kernel
+from morpheyes_daemon.simulation.kernel import allocating, inlined, kernel
 
 NEAR_M = 0.05
 
@@ -24,11 +25,17 @@ SAMPLES: NDArray[np.float64] = np.array(
 )
 """Offsets (x, y) in pixels of the samples of a pixel: its centre, then a rotated grid."""
 
+TILE = 8
+"""Edge in pixels of the tiles for which the farthest sample is known."""
+
+REFRESH_TRIANGLES = 600
+"""Triangles drawn until the tiles are looked at again."""
+
 PLANES = 12
 """Columns of a set-up record: the planes (x, y, 1) of 1/z, u/z, v/z and sun/z over the image."""
 
 
-@kernel
+@inlined
 def _sphere_is_seen(
     x: float, y: float, z: float, radius: float, f: float, cx: float, cy: float, width: int, height: int
 ) -> bool:
@@ -45,7 +52,7 @@ def _sphere_is_seen(
     )
 
 
-@kernel
+@inlined
 def _clip_near(q: Any, a: int, b: int, c: int, polygon: Any) -> int:
     """Write the corners (x, y) in pixels of triangle abc in front of the near plane; return how many there are."""
     n = 0
@@ -68,117 +75,129 @@ def _clip_near(q: Any, a: int, b: int, c: int, polygon: Any) -> int:
     return n
 
 
-@kernel
-def _set_up(q: Any, a: int, b: int, c: int, attributes: Any, two_sided: bool, record: Any) -> bool:
-    """Fill one record with plane equations; False for a triangle seen from behind or edge-on."""
+@inlined
+def _set_up(q: Any, a: int, b: int, c: int, attributes: Any, v0: int, two_sided: bool, records: Any, i: int) -> bool:
+    """Fill record i with plane equations; False for a triangle seen from behind or edge-on."""
     ax, ay, az = q[a, 0], q[a, 1], q[a, 2]
     bx, by, bz = q[b, 0], q[b, 1], q[b, 2]
     cx, cy, cz = q[c, 0], q[c, 1], q[c, 2]
     # rows of the adjugate of [a b c]
     a0, a1, a2 = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
-    b0, b1, b2 = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
-    c0, c1, c2 = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     determinant = ax * a0 + ay * a1 + az * a2
     if determinant == 0.0 or (determinant > 0.0 and not two_sided):
         return False
+    b0, b1, b2 = cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax
+    c0, c1, c2 = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     scale = 1.0 / determinant
-    record[0] = (a0 + b0 + c0) * scale
-    record[1] = (a1 + b1 + c1) * scale
-    record[2] = (a2 + b2 + c2) * scale
+    records[i, 0] = (a0 + b0 + c0) * scale
+    records[i, 1] = (a1 + b1 + c1) * scale
+    records[i, 2] = (a2 + b2 + c2) * scale
     for k in range(3):
-        p, r, s = attributes[a, k] * scale, attributes[b, k] * scale, attributes[c, k] * scale
-        record[3 + 3 * k] = p * a0 + r * b0 + s * c0
-        record[4 + 3 * k] = p * a1 + r * b1 + s * c1
-        record[5 + 3 * k] = p * a2 + r * b2 + s * c2
+        p, r, s = attributes[v0 + a, k] * scale, attributes[v0 + b, k] * scale, attributes[v0 + c, k] * scale
+        records[i, 3 + 3 * k] = p * a0 + r * b0 + s * c0
+        records[i, 4 + 3 * k] = p * a1 + r * b1 + s * c1
+        records[i, 5 + 3 * k] = p * a2 + r * b2 + s * c2
     return True
 
 
-@kernel
+@inlined
+def _fill(buffer: Any, s: int, row: int, x0: int, x1: int, value: Any, step: Any, index: int) -> None:
+    """Put a span of growing or shrinking 1/z into one row of a sample plane where it is nearest."""
+    low = np.uint64(index)
+    for x in range(x0, x1):
+        key = np.uint64(np.float32(value + step * np.float32(x - x0)).view(np.uint32)) << np.uint64(32) | low
+        if key > buffer[s, row, np.uint64(x)]:
+            buffer[s, row, np.uint64(x)] = key
+
+
+@inlined
 def _scan(
-    polygon: Any, n: int, record: Any, index: int, samples: Any, spans: Any, inverse_z: Any, indices: Any
+    xa: float, ya: float, xb: float, yb: float, xc: float, yc: float, records: Any, i: int, samples: Any, buffer: Any
 ) -> None:
-    """Scan-convert a convex polygon into every sample plane, keeping what is nearest."""
-    planes, height, width = inverse_z.shape
-    y_low, y_high = polygon[0, 1], polygon[0, 1]
-    x_low, x_high = polygon[0, 0], polygon[0, 0]
-    for k in range(1, n):
-        y_low, y_high = min(y_low, polygon[k, 1]), max(y_high, polygon[k, 1])
-        x_low, x_high = min(x_low, polygon[k, 0]), max(x_high, polygon[k, 0])
-    if x_high < -0.5 or x_low > width - 0.5 or y_high < -0.5 or y_low > height - 0.5:
+    """Scan-convert a triangle given in pixels into every sample plane, keeping what is nearest."""
+    planes, height, width = buffer.shape
+    if ya > yb:
+        xa, ya, xb, yb = xb, yb, xa, ya
+    if yb > yc:
+        xb, yb, xc, yc = xc, yc, xb, yb
+    if ya > yb:
+        xa, ya, xb, yb = xb, yb, xa, ya
+    if yc < -0.5 or ya > height - 0.5 or max(xa, xb, xc) < -0.5 or min(xa, xb, xc) > width - 0.5 or ya == yc:
         return
-    first = math.ceil(max(y_low - 0.5, 0.0))
-    last = math.ceil(min(y_high + 0.5, float(height)))
+    # edges always run downwards, whichever triangle they belong to
+    slope_ac = (xc - xa) / (yc - ya)
+    slope_ab = (xb - xa) / (yb - ya) if yb > ya else 0.0
+    slope_bc = (xc - xb) / (yc - yb) if yc > yb else 0.0
+    b_is_right = xa + (yb - ya) * slope_ac < xb
+    dx, dy, c = records[i, 0], records[i, 1], records[i, 2]
+    wide, high = float(width), float(height)
     for s in range(planes):
+        ox, oy = samples[s, 0], samples[s, 1]
+        first = math.ceil(min(max(ya - oy, 0.0), high))
+        middle = math.ceil(min(max(yb - oy, 0.0), high))
+        last = math.ceil(min(max(yc - oy, 0.0), high))
         for row in range(first, last):
-            spans[s, row, 0] = width
-            spans[s, row, 1] = 0
-    for k in range(n):
-        xa, ya = polygon[k, 0], polygon[k, 1]
-        xb, yb = polygon[(k + 1) % n, 0], polygon[(k + 1) % n, 1]
-        if ya == yb:
-            continue
-        if ya > yb:
-            xa, ya, xb, yb = xb, yb, xa, ya
-        slope = (xb - xa) / (yb - ya)
-        for s in range(planes):
-            ox, oy = samples[s, 0], samples[s, 1]
-            top = math.ceil(max(ya - oy, 0.0))
-            bottom = math.ceil(min(yb - oy, float(height)))
-            for row in range(top, bottom):
-                x = xa + (row + oy - ya) * slope - ox
-                column = math.ceil(min(max(x, 0.0), float(width)))
-                spans[s, row, 0] = min(spans[s, row, 0], column)
-                spans[s, row, 1] = max(spans[s, row, 1], column)
-    for s in range(planes):
-        for row in range(first, last):
-            x0, x1 = spans[s, row, 0], spans[s, row, 1]
+            y = row + oy
+            left = xa + (y - ya) * slope_ac
+            right = xa + (y - ya) * slope_ab if row < middle else xb + (y - yb) * slope_bc
+            if not b_is_right:
+                left, right = right, left
+            x0 = math.ceil(max(left - ox, 0.0))
+            x1 = math.ceil(min(right - ox, wide))
             if x0 < x1:
-                at_x0 = record[0] * (x0 + samples[s, 0]) + record[1] * (row + samples[s, 1]) + record[2]
-                _fill(np.float32(at_x0), np.float32(record[0]), index, inverse_z[s, row, x0:x1], indices[s, row, x0:x1])
+                start = np.float32(dx * (x0 + ox) + dy * y + c)
+                _fill(buffer, s, row, x0, x1, start, np.float32(dx), i)
 
 
-@kernel
-def _fill(start: Any, step: Any, index: int, inverse_z: Any, indices: Any) -> None:
-    for x in range(inverse_z.shape[0]):
-        value = start + step * np.float32(x)
-        if value > inverse_z[x]:
-            inverse_z[x] = value
-            indices[x] = index
+@inlined
+def _refresh(buffer: Any, farthest: Any) -> None:
+    """Note for every tile the smallest 1/z of its samples (0 where one is empty): what lies behind is hidden."""
+    planes, height, width = buffer.shape
+    for i in range(farthest.shape[0]):
+        for j in range(farthest.shape[1]):
+            smallest = np.uint64(0xFFFFFFFFFFFFFFFF)
+            for s in range(planes):
+                for row in range(i * TILE, min((i + 1) * TILE, height)):
+                    for column in range(j * TILE, min((j + 1) * TILE, width)):
+                        smallest = min(smallest, buffer[s, row, column])
+                if smallest == np.uint64(0):
+                    break
+            farthest[i, j] = np.uint32(smallest >> np.uint64(32)).view(np.float32)
 
 
-@kernel
-def rasterise(
-    vertices: Any,
-    attributes: Any,
-    triangles: Any,
-    bounds: Any,
-    ranges: Any,
-    flags: Any,
-    first_part: int,
-    R: Any,
-    t: Any,
-    eye: Any,
-    intrinsics: Any,
-    samples: Any,
-    inverse_z: Any,
-    indices: Any,
-    records: Any,
-    record_parts: Any,
-    record_groups: Any,
-    count: int,
-) -> int:
-    """Draw one batch of parts; return how many set-up records are in use now.
+@inlined
+def _is_hidden(polygon: Any, n: int, inverse_z: float, farthest: Any) -> bool:
+    """Tell whether all tiles that a polygon touches are full of nearer things, or it is off the image."""
+    x_low, x_high = polygon[0, 0], polygon[0, 0]
+    y_low, y_high = polygon[0, 1], polygon[0, 1]
+    for k in range(1, n):
+        x_low, x_high = min(x_low, polygon[k, 0]), max(x_high, polygon[k, 0])
+        y_low, y_high = min(y_low, polygon[k, 1]), max(y_high, polygon[k, 1])
+    rows, columns = farthest.shape
+    if not (x_high > -0.5 and y_high > -0.5 and x_low < columns * TILE and y_low < rows * TILE):
+        return True
+    # a pixel reaches half its width around its centre
+    i0, i1 = int(max(y_low - 0.5, 0.0)) // TILE, int(min(y_high + 0.5, rows * TILE - 1.0)) // TILE
+    j0, j1 = int(max(x_low - 0.5, 0.0)) // TILE, int(min(x_high + 0.5, columns * TILE - 1.0)) // TILE
+    for i in range(i0, i1 + 1):
+        for j in range(j0, j1 + 1):
+            if farthest[i, j] < inverse_z:
+                return False
+    return True
 
-    vertices (V, 3), attributes (V, 3) = (u, v, sun), triangles (T, 3) in the batch's frame; per part: bounds (P, 6)
-    = sphere x, y, z, radius and the distances from `eye` between which it is drawn, ranges (P, 4) = first vertex,
-    end, first triangle, end, flags (P, 2) = two-sided, loose. R, t take the batch's frame to the camera's; eye (3,) in the batch's frame.
+
+@allocating
+def visible_parts(bounds: Any, R: Any, t: Any, eye: Any, intrinsics: Any, size: Any) -> Any:
+    """Return the numbers of the parts in view and in drawing range, nearest first.
+
+    bounds (P, 6) = sphere x, y, z, radius and the distances from `eye` (3,) between which a part is drawn; R, t take
+    the parts' frame to the camera's; size = (width, height) in pixels.
     """
     f, cx, cy = intrinsics
-    _, height, width = inverse_z.shape
-    q = np.empty((np.max(ranges[:, 1] - ranges[:, 0]), 3))
-    polygon = np.empty((4, 2))
-    spans = np.empty((inverse_z.shape[0], height, 2), np.int32)
-    for part in range(ranges.shape[0]):
+    found = np.empty(len(bounds), np.int64)
+    distances = np.empty(len(bounds))
+    n = 0
+    for part in range(len(bounds)):
         x, y, z, radius = bounds[part, 0], bounds[part, 1], bounds[part, 2], bounds[part, 3]
         distance = math.sqrt((x - eye[0]) ** 2 + (y - eye[1]) ** 2 + (z - eye[2]) ** 2)
         if distance < bounds[part, 4] or distance >= bounds[part, 5]:
@@ -186,25 +205,75 @@ def rasterise(
         px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
         py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
         pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
-        if not _sphere_is_seen(px, py, pz, radius, f, cx, cy, width, height):
-            continue
+        if _sphere_is_seen(px, py, pz, radius, f, cx, cy, size[0], size[1]):
+            found[n], distances[n] = part, distance - radius
+            n += 1
+    return found[:n][np.argsort(distances[:n], kind="mergesort")]
+
+
+@inlined
+def _transform(vertices: Any, first: int, last: int, R: Any, t: Any, intrinsics: Any, q: Any) -> None:
+    """Write homogeneous pixels (x z, y z, z) of some vertices."""
+    f, cx, cy = intrinsics
+    for i in range(first, last):
+        x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
+        q[i - first, 0] = f * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) + cx * depth
+        q[i - first, 1] = f * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) + cy * depth
+        q[i - first, 2] = depth
+
+
+@kernel
+def rasterise(
+    order: Any,
+    vertices: Any,
+    attributes: Any,
+    triangles: Any,
+    ranges: Any,
+    flags: Any,
+    first_part: int,
+    R: Any,
+    t: Any,
+    intrinsics: Any,
+    samples: Any,
+    buffer: Any,
+    farthest: Any,
+    q: Any,
+    polygon: Any,
+    records: Any,
+    record_parts: Any,
+    record_groups: Any,
+    count: int,
+) -> int:
+    """Draw the parts of one batch in the given order; return how many set-up records are in use now.
+
+    vertices (V, 3), attributes (V, 3) = (u, v in tiles, sun), triangles (T, 3) in the batch's frame; per part: ranges (P, 4) =
+    first vertex, end, first triangle, end; flags (P, 2) = two-sided, loose. q (most vertices of
+    a part, 3) and polygon (4, 2) are scratch.
+    """
+    drawn = 0
+    for n in range(len(order)):
+        part = order[n]
+        if drawn > REFRESH_TRIANGLES:
+            _refresh(buffer, farthest)
+            drawn = 0
         v0 = ranges[part, 0]
-        for i in range(v0, ranges[part, 1]):
-            x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
-            pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
-            q[i - v0, 0] = f * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) + cx * pz
-            q[i - v0, 1] = f * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) + cy * pz
-            q[i - v0, 2] = pz
-        values = attributes[v0 : ranges[part, 1]]
+        _transform(vertices, v0, ranges[part, 1], R, t, intrinsics, q)
         for k in range(ranges[part, 2], ranges[part, 3]):
             a, b, c = triangles[k, 0] - v0, triangles[k, 1] - v0, triangles[k, 2] - v0
-            if q[a, 2] < NEAR_M and q[b, 2] < NEAR_M and q[c, 2] < NEAR_M:
+            corners = _clip_near(q, a, b, c, polygon)
+            nearest = 1.0 / max(min(q[a, 2], q[b, 2], q[c, 2]), NEAR_M)
+            if corners == 0 or _is_hidden(polygon, corners, nearest, farthest):
                 continue
-            if not _set_up(q, a, b, c, values, flags[part, 0], records[count]):
+            if not _set_up(q, a, b, c, attributes, v0, flags[part, 0], records, count):
                 continue
             record_parts[count] = first_part + part
             record_groups[count] = -2 - count if flags[part, 1] else first_part + part
-            corners = _clip_near(q, a, b, c, polygon)
-            _scan(polygon, corners, records[count], count, samples, spans, inverse_z, indices)
+            for corner in range(2, corners):
+                _scan(
+                    polygon[0, 0], polygon[0, 1], polygon[corner - 1, 0], polygon[corner - 1, 1],
+                    polygon[corner, 0], polygon[corner, 1], records, count, samples, buffer,
+                )  # fmt: skip
             count += 1
+            drawn += 1
     return count

@@ -8,7 +8,7 @@ twin's business.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages import FloatMap, Image, Pinhole
-from morpheyes_daemon.simulation.raster import PLANES, SAMPLES, rasterise
+from morpheyes_daemon.simulation.raster import PLANES, SAMPLES, TILE, rasterise, visible_parts
 from morpheyes_daemon.simulation.scene import SKY_OBJECT, Material, Mesh, Scene
 from morpheyes_daemon.simulation.shading import shade_image
 from morpheyes_daemon.simulation.textures import Atlas, pack
@@ -56,12 +56,12 @@ class _Batch:
     first_part: int
 
 
-def _batch(meshes: Sequence[Mesh], first_part: int) -> _Batch:
+def _batch(meshes: Sequence[Mesh], materials: Mapping[str, Material], first_part: int) -> _Batch:
     sizes = np.array([[len(m.vertices_m), len(m.triangles)] for m in meshes], np.int64).reshape(-1, 2)
     ends = np.cumsum(sizes, axis=0)
     starts = ends - sizes
     vertices = np.concatenate([m.vertices_m for m in meshes]).astype(np.float64)
-    attributes = np.concatenate([np.column_stack([m.uv_m, m.sun]) for m in meshes]).astype(np.float64)
+    attributes = np.concatenate([np.column_stack([m.uv_m * materials[m.material].tiles_per_m, m.sun]) for m in meshes]).astype(np.float64)
     triangles = np.concatenate([m.triangles + s for m, s in zip(meshes, starts[:, 0], strict=True)])
     bounds = np.array([(*_sphere(m.vertices_m), *m.draw_range_m) for m in meshes], np.float64)
     ranges = np.column_stack([starts[:, 0], ends[:, 0], starts[:, 1], ends[:, 1]])
@@ -75,6 +75,29 @@ def _sphere(vertices: Array) -> tuple[float, float, float, float]:
     return float(centre[0]), float(centre[1]), float(centre[2]), radius
 
 
+class _Workspace:
+    """Scratch memory of one renderer: set-up records, transformed vertices, and a buffer per image size."""
+
+    def __init__(self, triangles: int, vertices: int) -> None:
+        self.records = np.empty((triangles, PLANES))
+        self.parts = np.empty(triangles, np.int32)
+        self.groups = np.empty(triangles, np.int32)
+        self.transformed = np.empty((vertices, 3))
+        self.polygon = np.empty((4, 2))
+        self.sample_groups = np.empty(len(SAMPLES), np.int64)
+        self._buffers: dict[tuple[int, int], tuple[NDArray[np.uint64], FloatMap]] = {}
+
+    def cleared(self, shape: tuple[int, int]) -> tuple[NDArray[np.uint64], FloatMap]:
+        """Return an empty visibility buffer and its tiles."""
+        if shape not in self._buffers:
+            tiles = (-(-shape[0] // TILE), -(-shape[1] // TILE))
+            self._buffers[shape] = np.empty((len(SAMPLES), *shape), np.uint64), np.empty(tiles, np.float32)
+        buffer, farthest = self._buffers[shape]
+        buffer.fill(0)
+        farthest.fill(0.0)
+        return buffer, farthest
+
+
 class Renderer:
     """Draws one scene; not to be shared between threads."""
 
@@ -82,37 +105,41 @@ class Renderer:
         self.scene = scene
         self._atlas: Atlas = pack(scene.textures)
         names = {name: i for i, name in enumerate(scene.materials)}
-        self._materials = np.array([self._material_row(m) for m in scene.materials.values()])
+        rows = [self._material_rows(m) for m in scene.materials.values()]
+        self._materials = np.array([row for row, _ in rows], np.int64)
+        self._ratios = np.array([ratios for _, ratios in rows])
         sky = (scene.sky,) if scene.sky is not None else ()
-        groups = [tuple(scene.meshes), sky, *(body.meshes for body in scene.moving)]
+        groups = [*(body.meshes for body in scene.moving), tuple(scene.meshes), sky]
         meshes = [mesh for group in groups for mesh in group]
         starts = np.cumsum([0, *(len(group) for group in groups)])
-        self._batches = [_batch(g, int(s)) if g else None for g, s in zip(groups, starts, strict=False)]
-        self._looks = np.array([(*m.tint, m.ambient) for m in meshes])
+        self._batches = [_batch(g, scene.materials, int(s)) if g else None for g, s in zip(groups, starts, strict=False)]
+        self._looks = np.array([(*m.tint, m.ambient) for m in meshes], np.float32)
         self._part_materials = np.array([names[m.material] for m in meshes], np.int64)
         self._part_objects = np.array([m.object_id for m in meshes], np.int32)
         light = scene.light
-        self._light = np.array([light.sun, light.sky, light.haze, (1.0 / light.haze_range_m, 0.0, 0.0)])
-        triangles = sum(len(mesh.triangles) for mesh in meshes)
-        self._records = np.empty((triangles, PLANES))
-        self._record_parts = np.empty(triangles, np.int32)
-        self._record_groups = np.empty(triangles, np.int32)
-        self._buffers: dict[tuple[int, int], tuple[FloatMap, NDArray[np.int32]]] = {}
+        self._light = np.array([light.sun, light.sky, light.haze, (1.0 / light.haze_range_m, 0.0, 0.0)], np.float32)
+        self._work = _Workspace(
+            triangles=sum(len(mesh.triangles) for mesh in meshes),
+            vertices=max(len(mesh.vertices_m) for mesh in meshes),
+        )
 
     def sibling(self) -> Renderer:
         """Return a renderer of the same scene with buffers of its own, for another thread."""
         other = copy.copy(self)
-        other._records = np.empty_like(self._records)
-        other._record_parts = np.empty_like(self._record_parts)
-        other._record_groups = np.empty_like(self._record_groups)
-        other._buffers = {}
+        other._work = _Workspace(len(self._work.records), len(self._work.transformed))
         return other
 
-    def _material_row(self, m: Material) -> tuple[float, ...]:
-        index = self._atlas.names.index
-        modulation = -1 if m.modulation is None else index(m.modulation)
-        kind = 2.0 if m.sky else 1.0 if m.emissive else 0.0
-        return (index(m.texture), *m.tiles_per_m, modulation, *m.modulation_tiles_per_m, kind)
+    def _material_rows(self, m: Material) -> tuple[tuple[int, ...], tuple[float, ...]]:
+        """Return a material's rows for `shade_image`: textures and kind, and how the two textures relate."""
+        index, sizes = self._atlas.names.index, self._atlas.log_sizes
+        kind = 2 if m.sky else 1 if m.emissive else 0
+        detail = index(m.texture)
+        if m.modulation is None:
+            return (detail, int(sizes[detail]), -1, 0, kind), (0.0, 0.0, 0.0)
+        coarse = index(m.modulation)
+        ratio = np.divide(m.modulation_tiles_per_m, m.tiles_per_m)
+        levels = float(np.log2(ratio).mean() + sizes[coarse] - sizes[detail])
+        return (detail, int(sizes[detail]), coarse, int(sizes[coarse]), kind), (*ratio, levels)
 
     def render(self, T_ned_cam: Array, pinhole: Pinhole, t_s: float = 0.0, eye_ned: Array | None = None) -> Rendered:
         """Render what a camera at `T_ned_cam` (4, 4; x right, y down, z forward) sees at world time `t_s`.
@@ -120,37 +147,34 @@ class Renderer:
         `eye_ned` (3,) is what drawing ranges are measured from; pass the same for both eyes of a pair.
         """
         shape = (pinhole.height, pinhole.width)
-        inverse_z, indices = self._cleared(shape)
+        work = self._work
+        buffer, farthest = work.cleared(shape)
         intrinsics = (pinhole.f_px, pinhole.cx_px, pinhole.cy_px)
         eye = T_ned_cam[:3, 3] if eye_ned is None else eye_ned
-        frames = [np.eye(4), pose(np.eye(3), T_ned_cam[:3, 3])]
-        frames += [body.T_ned_object(t_s) for body in self.scene.moving]
         count = 0
-        for batch, T_ned_batch in zip(self._batches, frames, strict=True):
-            if batch is not None:
-                T_cam_batch = inverse(T_ned_cam) @ T_ned_batch
-                eye_batch = inverse(T_ned_batch)[:3, :3] @ (eye - T_ned_batch[:3, 3])
-                count = rasterise(
-                    batch.vertices, batch.attributes, batch.triangles, batch.bounds, batch.ranges, batch.flags,
-                    batch.first_part, T_cam_batch[:3, :3].copy(), T_cam_batch[:3, 3].copy(), eye_batch, intrinsics,
-                    SAMPLES, inverse_z, indices, self._records, self._record_parts,
-                    self._record_groups, count,
-                )  # fmt: skip
+        for batch, T_ned_batch in zip(self._batches, self._frames(T_ned_cam, t_s), strict=True):
+            if batch is None:
+                continue
+            T_cam_batch = inverse(T_ned_cam) @ T_ned_batch
+            R, t = T_cam_batch[:3, :3].copy(), T_cam_batch[:3, 3].copy()
+            eye_batch = T_ned_batch[:3, :3].T @ (eye - T_ned_batch[:3, 3])
+            order = visible_parts(batch.bounds, R, t, eye_batch, intrinsics, (pinhole.width, pinhole.height))
+            count = rasterise(
+                order, batch.vertices, batch.attributes, batch.triangles, batch.ranges, batch.flags, batch.first_part,
+                R, t, intrinsics, SAMPLES, buffer, farthest, work.transformed, work.polygon,
+                work.records, work.parts, work.groups, count,
+            )  # fmt: skip
         rendered = Rendered(
             np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.full(shape, SKY_OBJECT, np.int32)
         )
         shade_image(
-            indices, SAMPLES, self._records, self._record_parts, self._record_groups, self._looks, self._part_materials,
-            self._part_objects, self._materials, (self._atlas.texels, self._atlas.levels, self._atlas.log_sizes),
+            buffer, SAMPLES, work.sample_groups, work.records, work.parts, work.groups, self._looks, self._part_materials,
+            self._part_objects, self._materials, self._ratios, self._atlas.texels, self._atlas.levels,
             self._light, rendered.radiance, rendered.depth_m, rendered.objects,
         )  # fmt: skip
         return rendered
 
-    def _cleared(self, shape: tuple[int, int]) -> tuple[FloatMap, NDArray[np.int32]]:
-        if shape not in self._buffers:
-            planes = (len(SAMPLES), *shape)
-            self._buffers[shape] = np.empty(planes, np.float32), np.empty(planes, np.int32)
-        inverse_z, indices = self._buffers[shape]
-        inverse_z.fill(0.0)
-        indices.fill(-1)
-        return inverse_z, indices
+    def _frames(self, T_ned_cam: Array, t_s: float) -> list[Array]:
+        """Where each batch is: moving objects, what stands, and the sky around the eye; the nearest things first."""
+        moving = [body.T_ned_object(t_s) for body in self.scene.moving]
+        return [*moving, np.eye(4), pose(np.eye(3), T_ned_cam[:3, 3])]

@@ -13,123 +13,175 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.simulation.kernel import kernel
+from morpheyes_daemon.simulation.kernel import inlined, kernel
 
-MAX_TAPS = 6
+MAX_TAPS = 3
 """Most texture taps along the longer axis of a pixel's footprint."""
 
+REUSE_PX = 6
+"""Neighbouring pixels of one triangle that share a footprint."""
 
-@kernel
+SMALLEST_LEVEL = 2
+"""log2 of the size of the last mip level."""
+
+FAR_TILES = float(1 << 16)
+RECORD = np.uint64(0xFFFFFFFF)
+DONE = np.iinfo(np.int64).min
+
+
+@inlined
 def _log2(x: float) -> float:
     """Approximate the binary logarithm to 0.09 from the bits of a float32."""
     bits = np.float32(x).view(np.int32)
     return (bits >> 23) - 127 + (bits & 0x7FFFFF) * (1.0 / 0x800000)
 
 
-@kernel
-def _bilinear(texels: Any, start: int, log_size: int, u: float, v: float) -> tuple[float, float, float, float]:
-    """Sample one mip level (wrapping) at (u, v) in tiles; four channels in 0..255."""
+@inlined
+def _lanes(texel: Any) -> Any:
+    """Spread the four bytes of a texel into four 16-bit lanes."""
+    wide = np.uint64(texel)
+    wide = (wide | (wide << np.uint64(16))) & np.uint64(0x0000FFFF0000FFFF)
+    return (wide | (wide << np.uint64(8))) & np.uint64(0x00FF00FF00FF00FF)
+
+
+@inlined
+def _bilinear(texels: Any, start: int, log_size: int, u: float, v: float) -> Any:
+    """Sample one mip level (wrapping) at (u, v) in tiles; four 16-bit lanes, 255 * 256 for 1."""
     size = 1 << log_size
     mask = size - 1
-    x, y = u * size - 0.5, v * size - 0.5
-    x0, y0 = math.floor(x), math.floor(y)
-    fx, fy = np.float32(x - x0), np.float32(y - y0)
-    row0, row1 = start + ((y0 & mask) << log_size), start + (((y0 + 1) & mask) << log_size)
-    i, j = x0 & mask, (x0 + 1) & mask
-    one = np.float32(1.0)
-    w00, w01 = (one - fx) * (one - fy), fx * (one - fy)
-    w10, w11 = (one - fx) * fy, fx * fy
-    a, b, c, d = texels[row0 + i], texels[row0 + j], texels[row1 + i], texels[row1 + j]
+    # tiles repeat, so a whole number of them keeps the truncation on the positive side
+    x, y = int((u + FAR_TILES) * (size * 256.0)) - 128, int((v + FAR_TILES) * (size * 256.0)) - 128
+    fx, fy = x & 255, y & 255
+    x0, y0, x1, y1 = (x >> 8) & mask, (y >> 8) & mask, ((x >> 8) + 1) & mask, ((y >> 8) + 1) & mask
+    # texels lie in blocks of 4 x 4, see textures.pack
+    row0, row1 = start + ((y0 >> 2) << (log_size + 2)) + ((y0 & 3) << 2), start + ((y1 >> 2) << (log_size + 2)) + ((y1 & 3) << 2)
+    column0, column1 = ((x0 >> 2) << 4) + (x0 & 3), ((x1 >> 2) << 4) + (x1 & 3)
+    w11 = (fx * fy) >> 8
     return (
-        w00 * a[0] + w01 * b[0] + w10 * c[0] + w11 * d[0],
-        w00 * a[1] + w01 * b[1] + w10 * c[1] + w11 * d[1],
-        w00 * a[2] + w01 * b[2] + w10 * c[2] + w11 * d[2],
-        w00 * a[3] + w01 * b[3] + w10 * c[3] + w11 * d[3],
+        np.uint64(256 - fx - fy + w11) * _lanes(texels[np.uint64(row0 + column0)])
+        + np.uint64(fx - w11) * _lanes(texels[np.uint64(row0 + column1)])
+        + np.uint64(fy - w11) * _lanes(texels[np.uint64(row1 + column0)])
+        + np.uint64(w11) * _lanes(texels[np.uint64(row1 + column1)])
     )
 
 
-@kernel
-def _trilinear(
-    texels: Any, levels: Any, log_size: int, u: float, v: float, lod: float
-) -> tuple[float, float, float, float]:
-    """Sample between two mip levels; `levels` holds where each level starts."""
-    lod = min(max(lod, 0.0), float(log_size))
-    level = int(lod)
-    w = np.float32(lod - level)
-    a0, a1, a2, a3 = _bilinear(texels, levels[level], log_size - level, u, v)
-    if w < np.float32(0.02):
-        return a0, a1, a2, a3
-    b0, b1, b2, b3 = _bilinear(texels, levels[level + 1], log_size - level - 1, u, v)
-    return a0 + w * (b0 - a0), a1 + w * (b1 - a1), a2 + w * (b2 - a2), a3 + w * (b3 - a3)
+@inlined
+def _unpacked(lanes: Any) -> tuple[Any, Any, Any, Any]:
+    """Return the four lanes as numbers."""
+    low = np.uint64(0xFFFF)
+    return (
+        np.float32(np.int32(lanes & low)),
+        np.float32(np.int32((lanes >> np.uint64(16)) & low)),
+        np.float32(np.int32((lanes >> np.uint64(32)) & low)),
+        np.float32(np.int32(lanes >> np.uint64(48))),
+    )
 
 
-@kernel
-def _anisotropic(
-    texels: Any, levels: Any, log_size: int, u: float, v: float, gradients: tuple[float, float, float, float]
-) -> tuple[float, float, float, float]:
-    """Sample along the longer axis of the footprint; gradients du/dx, dv/dx, du/dy, dv/dy in tiles per pixel."""
-    ux, vx, uy, vy = gradients
-    size = 1 << log_size
+@inlined
+def _footprint(x: float, y: float, records: Any, i: int, size: float) -> tuple[float, int, float, float]:
+    """Return how a pixel of record i reads its texture: mip level, number of taps, and their spread in tiles."""
+    z = 1.0 / (records[i, 0] * x + records[i, 1] * y + records[i, 2])
+    u = (records[i, 3] * x + records[i, 4] * y + records[i, 5]) * z
+    v = (records[i, 6] * x + records[i, 7] * y + records[i, 8]) * z
+    ux, vx = (records[i, 3] - u * records[i, 0]) * z, (records[i, 6] - v * records[i, 0]) * z
+    uy, vy = (records[i, 4] - u * records[i, 1]) * z, (records[i, 7] - v * records[i, 1]) * z
     across, along = ux * ux + vx * vx, uy * uy + vy * vy
     if across > along:
         across, along, uy, vy = along, across, ux, vx
-    ratio = math.sqrt(along / max(across, 1e-12))
-    taps = min(max(math.ceil(ratio - 0.3), 1), MAX_TAPS)
-    lod = 0.5 * _log2(max(along * size * size / (taps * taps), 1e-12))
-    r, g, b, a = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
-    for k in range(taps):
-        w = (k + 0.5) / taps - 0.5
-        s0, s1, s2, s3 = _trilinear(texels, levels, log_size, u + w * uy, v + w * vy, lod)
-        r, g, b, a = r + s0, g + s1, b + s2, a + s3
-    share = np.float32(1.0 / (255.0 * taps))
-    return r * share, g * share, b * share, a * share
+    taps = 1
+    while taps < MAX_TAPS and along > (taps + 0.3) * (taps + 0.3) * across:
+        taps += 1
+    lod = 0.5 * _log2(along * (size * size) / (taps * taps) + 1e-9)
+    return lod, taps, uy / taps, vy / taps
 
 
-@kernel
+@inlined
+def _detail(
+    texels: Any, levels: Any, texture: int, log_size: int, u: float, v: float,
+    lod: float, taps: int, du: float, dv: float,
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """Sample a texture's colour (0..1) trilinearly, averaging `taps` taps."""
+    lod = min(max(lod, 0.0), float(log_size - SMALLEST_LEVEL))
+    level = int(lod)
+    # only the middle of the way between two levels is blended
+    w1 = np.float32(min(max(1.6 * (lod - level) - 0.3, 0.0), 1.0))
+    w0 = np.float32(1.0) - w1
+    b, g, r = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    p, q = u - 0.5 * (taps - 1) * du, v - 0.5 * (taps - 1) * dv
+    for _ in range(taps):
+        if w0 > np.float32(0.0):
+            s0, s1, s2, _s = _unpacked(_bilinear(texels, levels[texture, level], log_size - level, p, q))
+            b, g, r = b + w0 * s0, g + w0 * s1, r + w0 * s2
+        if w1 > np.float32(0.0):
+            s0, s1, s2, _s = _unpacked(_bilinear(texels, levels[texture, level + 1], log_size - level - 1, p, q))
+            b, g, r = b + w1 * s0, g + w1 * s1, r + w1 * s2
+        p, q = p + du, q + dv
+    share = np.float32(1.0 / (255.0 * 256.0)) / np.float32(taps)
+    return b * share, g * share, r * share
+
+
+@inlined
 def _shade(
-    x: float, y: float, record: Any, part: int, look: Any, material: Any, atlas: Any, light: Any
-) -> tuple[float, float, float]:
-    """Return the linear radiance (blue, green, red) of one surface point."""
-    texels, levels, log_sizes = atlas
-    iz = record[0] * x + record[1] * y + record[2]
-    z = 1.0 / iz
-    u = (record[3] * x + record[4] * y + record[5]) * z
-    v = (record[6] * x + record[7] * y + record[8]) * z
-    sun = min(max((record[9] * x + record[10] * y + record[11]) * z, 0.0), 1.0)
-    gradients = (
-        (record[3] - u * record[0]) * z,
-        (record[6] - v * record[0]) * z,
-        (record[4] - u * record[1]) * z,
-        (record[7] - v * record[1]) * z,
-    )
-    texture, su, sv = int(material[0]), material[1], material[2]
-    b, g, r, _ = _anisotropic(
-        texels, levels[texture], log_sizes[texture], u * su, v * sv,
-        (gradients[0] * su, gradients[1] * sv, gradients[2] * su, gradients[3] * sv),
-    )
-    b, g, r = b * b * look[0], g * g * look[1], r * r * look[2]
-    if material[6] > 0.0:
+    x: float, y: float, records: Any, i: int, part: int, footprint: tuple[float, int, float, float],
+    looks: Any, materials: Any, m: int, ratios: Any, texels: Any, levels: Any, light: Any,
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """Return the linear radiance (blue, green, red) of the surface of record i at pixel (x, y)."""
+    lod, taps, du, dv = footprint
+    z = 1.0 / (records[i, 0] * x + records[i, 1] * y + records[i, 2])
+    u = (records[i, 3] * x + records[i, 4] * y + records[i, 5]) * z
+    v = (records[i, 6] * x + records[i, 7] * y + records[i, 8]) * z
+    b, g, r = _detail(texels, levels, materials[m, 0], materials[m, 1], u, v, lod, taps, du, dv)
+    b, g, r = b * b * looks[part, 0], g * g * looks[part, 1], r * r * looks[part, 2]
+    if materials[m, 4] > 0:
         return b, g, r
-    if material[3] >= 0.0:
-        texture, su, sv = int(material[3]), material[4], material[5]
-        mb, mg, mr, ms = _anisotropic(
-            texels, levels[texture], log_sizes[texture], u * su, v * sv,
-            (gradients[0] * su, gradients[1] * sv, gradients[2] * su, gradients[3] * sv),
-        )
-        b, g, r, sun = b * mb * 2.0, g * mg * 2.0, r * mr * 2.0, sun * ms
-    haze = z * light[3, 0]
-    haze = haze * haze / (1.0 + haze * haze)
-    ambient = look[3]
+    sun = np.float32((records[i, 9] * x + records[i, 10] * y + records[i, 11]) * z)
+    sun = min(max(sun, np.float32(0.0)), np.float32(1.0))
+    texture, log_size = materials[m, 2], materials[m, 3]
+    if texture >= 0:
+        level = int(min(max(lod + ratios[m, 2] + 0.5 * taps, 0.0), float(log_size - SMALLEST_LEVEL)))
+        lanes = _bilinear(texels, levels[texture, level], log_size - level, u * ratios[m, 0], v * ratios[m, 1])
+        mb, mg, mr, ms = _unpacked(lanes)
+        double = np.float32(2.0 / (255.0 * 256.0))
+        b, g, r, sun = b * mb * double, g * mg * double, r * mr * double, sun * ms * np.float32(0.5) * double
+    haze = np.float32(z) * light[3, 0]
+    haze = haze * haze
+    haze = haze / (np.float32(1.0) + haze)
+    ambient = looks[part, 3]
     b = b * (sun * light[0, 0] + ambient * light[1, 0])
     g = g * (sun * light[0, 1] + ambient * light[1, 1])
     r = r * (sun * light[0, 2] + ambient * light[1, 2])
     return b + haze * (light[2, 0] - b), g + haze * (light[2, 1] - g), r + haze * (light[2, 2] - r)
 
 
+@inlined
+def _gather(groups: Any, first: int, samples: Any) -> tuple[int, float, float]:
+    """Count the samples of one group, sum up their offsets, and mark them done."""
+    group, n, x, y = groups[first], 0, 0.0, 0.0
+    for s in range(first, len(groups)):
+        if groups[s] == group:
+            groups[s] = DONE
+            n += 1
+            x += samples[s, 0]
+            y += samples[s, 1]
+    return n, x, y
+
+
+@inlined
+def _is_uniform(buffer: Any, row: int, column: int, record_groups: Any, groups: Any) -> bool:
+    """Note the group of every sample of a pixel and tell whether they are all the same; -1 is nothing."""
+    uniform = True
+    for s in range(buffer.shape[0]):
+        key = buffer[s, row, column]
+        groups[s] = record_groups[key & RECORD] if key else -1
+        uniform = uniform and groups[s] == groups[0]
+    return uniform
+
+
 @kernel
 def shade_image(
-    indices: Any,
+    buffer: Any,
     samples: Any,
+    groups: Any,
     records: Any,
     record_parts: Any,
     record_groups: Any,
@@ -137,7 +189,9 @@ def shade_image(
     part_materials: Any,
     part_objects: Any,
     materials: Any,
-    atlas: Any,
+    ratios: Any,
+    texels: Any,
+    levels: Any,
     light: Any,
     radiance: Any,
     depth: Any,
@@ -145,64 +199,45 @@ def shade_image(
 ) -> None:
     """Fill radiance (H, W, 3) float32 BGR linear, depth (H, W) float32 (inf: sky), objects (H, W) int32 (-1: none).
 
-    looks (P, 4) = tint b, g, r and share of sky light per part; materials (M, 7) = texture, its tiles per metre in u
-    and v, modulating texture (-1: none), its tiles per metre, emissive; light (4, 3) = sun, sky, haze, 1/haze range.
+    looks (P, 4) = tint b, g, r and share of sky light per part; materials (M, 5) = texture, log2 of its size,
+    modulating texture (-1: none), log2 of its size, kind (1 emissive, 2 sky); ratios (M, 3) = tiles of the modulating
+    texture per tile in u and v, mip levels between the two; light (4, 3) = sun, sky, haze, 1/haze range; groups (samples,) int64 is scratch.
     """
-    planes, height, width = indices.shape
+    planes, height, width = buffer.shape
+    share = np.float32(1.0 / planes)
     for row in range(height):
+        known, fresh_until = -1, 0
+        footprint = (0.0, 1, 0.0, 0.0)
         for column in range(width):
-            first = indices[0, row, column]
-            part, group = -1, -1
-            depth[row, column] = np.inf
-            objects[row, column] = -1
-            if first >= 0:
-                part, group = record_parts[first], record_groups[first]
-                if materials[part_materials[part], 6] < 2.0:
-                    iz = records[first, 0] * column + records[first, 1] * row + records[first, 2]
-                    depth[row, column] = 1.0 / iz
-                    objects[row, column] = part_objects[part]
-            uniform = True
-            for s in range(1, planes):
-                other = indices[s, row, column]
-                if (record_groups[other] if other >= 0 else -1) != group:
-                    uniform = False
-            if uniform:
-                if part >= 0:
-                    b, g, r = _shade(
-                        float(column), float(row), records[first], part, looks[part],
-                        materials[part_materials[part]], atlas, light,
-                    )
-                else:
-                    b, g, r = light[2, 0], light[2, 1], light[2, 2]
-                radiance[row, column, 0] = b
-                radiance[row, column, 1] = g
-                radiance[row, column, 2] = r
-                continue
-            total_b, total_g, total_r = 0.0, 0.0, 0.0
-            done = 0
+            uniform = _is_uniform(buffer, row, column, record_groups, groups)
+            depth[row, column], objects[row, column] = np.inf, -1
+            blue, green, red = np.float32(0.0), np.float32(0.0), np.float32(0.0)
             for s in range(planes):
-                if done >> s & 1:
+                if groups[s] == DONE:
                     continue
-                index = indices[s, row, column]
-                part = record_parts[index] if index >= 0 else -1
-                group = record_groups[index] if index >= 0 else -1
-                n, x, y = 0, 0.0, 0.0
-                for other_s in range(s, planes):
-                    other = indices[other_s, row, column]
-                    if (record_groups[other] if other >= 0 else -1) == group:
-                        done |= 1 << other_s
-                        n += 1
-                        x += samples[other_s, 0]
-                        y += samples[other_s, 1]
+                n, x, y = planes, float(column), float(row)
+                if not uniform:
+                    n, dx, dy = _gather(groups, s, samples)
+                    x, y = column + dx / n, row + dy / n
+                key = buffer[s, row, column]
                 b, g, r = light[2, 0], light[2, 1], light[2, 2]
-                if part >= 0:
+                if key:
+                    i = np.int64(key & RECORD)
+                    part = record_parts[i]
+                    m = part_materials[part]
+                    if s == 0 and materials[m, 4] < 2:
+                        depth[row, column] = 1.0 / (records[i, 0] * column + records[i, 1] * row + records[i, 2])
+                        objects[row, column] = part_objects[part]
+                    if i != known or column >= fresh_until:
+                        footprint = _footprint(x, y, records, i, float(1 << materials[m, 1]))
+                        known, fresh_until = i, column + REUSE_PX
                     b, g, r = _shade(
-                        column + x / n, row + y / n, records[index], part, looks[part],
-                        materials[part_materials[part]], atlas, light,
+                        x, y, records, i, part, footprint, looks, materials, m, ratios, texels, levels, light
                     )
-                total_b += n * b
-                total_g += n * g
-                total_r += n * r
-            radiance[row, column, 0] = total_b / planes
-            radiance[row, column, 1] = total_g / planes
-            radiance[row, column, 2] = total_r / planes
+                weight = share * np.float32(n)
+                blue, green, red = blue + weight * b, green + weight * g, red + weight * r
+                if uniform:
+                    break
+            radiance[row, column, 0] = blue
+            radiance[row, column, 1] = green
+            radiance[row, column, 2] = red

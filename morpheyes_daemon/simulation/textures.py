@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -18,43 +18,70 @@ from numpy.typing import NDArray
 Texels = NDArray[np.uint8]
 Field = NDArray[np.float64]
 
+BLOCK = 4
+"""Texels lie in blocks of 4 x 4: one cache line."""
 
-@dataclass(frozen=True, slots=True, eq=False)
+
+@dataclass(frozen=True, eq=False)
 class Texture:
     """texels (N, N, 4) uint8: square root of linear blue, green, red, and a fourth channel (share of sunlight)."""
 
     texels: Texels
 
+    @cached_property
+    def levels(self) -> tuple[NDArray[np.uint32], ...]:
+        """Mip levels down to one block, colours averaged linearly, each laid out as `_blocks` says."""
+        value = self.texels.astype(np.float32)
+        value[..., :3] *= value[..., :3]
+        chain = [_blocks(self.texels)]
+        while value.shape[0] > BLOCK:
+            value = 0.25 * (value[::2, ::2] + value[1::2, ::2] + value[::2, 1::2] + value[1::2, 1::2])
+            encoded = value.copy()
+            encoded[..., :3] = np.sqrt(encoded[..., :3])
+            chain.append(_blocks(np.rint(encoded).astype(np.uint8)))
+        return tuple(chain)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Atlas:
-    """All textures with their mip levels in one array, texels (n, 4), as the kernels want them."""
+    """All textures with their mip levels in one array as the kernels want them.
+
+    texels (n,) uint32 hold blue in the lowest byte; levels (textures, levels) say where each mip level starts.
+    """
 
     names: tuple[str, ...]
-    texels: Texels
+    texels: NDArray[np.uint32]
     levels: NDArray[np.int64]
     log_sizes: NDArray[np.int64]
 
 
 def pack(textures: Mapping[str, Texture]) -> Atlas:
     """Lay out the mip levels of all textures."""
-    chains = [_mip_chain(texture) for texture in textures.values()]
-    levels = np.zeros((len(chains), max((len(chain) for chain in chains), default=1)), np.int64)
+    chains = [texture.levels for texture in textures.values()]
+    levels = np.zeros((len(chains), max(len(chain) for chain in chains)), np.int64)
     start = 0
     for i, chain in enumerate(chains):
         for k, level in enumerate(chain):
             levels[i, k] = start
-            start += level.shape[0] * level.shape[1]
-    flat = np.concatenate([level.reshape(-1, 4) for chain in chains for level in chain])
-    return Atlas(tuple(textures), flat, levels, np.array([len(chain) - 1 for chain in chains], np.int64))
+            start += level.size
+    flat = np.concatenate([level for chain in chains for level in chain])
+    log_sizes = np.array([t.texels.shape[0].bit_length() - 1 for t in textures.values()], np.int64)
+    return Atlas(tuple(textures), flat, levels, log_sizes)
+
+
+def _blocks(level: Texels) -> NDArray[np.uint32]:
+    """Return texels as numbers, block by block, so that neighbours in both directions share a cache line."""
+    n = level.shape[0] // BLOCK
+    packed = np.ascontiguousarray(level).view("<u4").reshape(n, BLOCK, n, BLOCK)
+    return packed.transpose(0, 2, 1, 3).reshape(-1).astype(np.uint32)
 
 
 def _mip_chain(texture: Texture) -> list[Texels]:
-    """Halve down to one texel; colours are averaged linearly."""
+    """Halve down to one block; colours are averaged linearly."""
     value = texture.texels.astype(np.float32)
     value[..., :3] **= 2
     chain = [texture.texels]
-    while value.shape[0] > 1:
+    while value.shape[0] > BLOCK:
         value = 0.25 * (value[::2, ::2] + value[1::2, ::2] + value[::2, 1::2] + value[1::2, 1::2])
         encoded = value.copy()
         encoded[..., :3] **= 0.5

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.simulation import forest
@@ -80,12 +79,10 @@ def _build_forest(world: ForestWorld, seed: int, height_m: float = 1.5) -> World
     solids: list[Solid] = []
     for tree in trees:
         solids.append(frustum_solid(tree.base, tree.top, tree.radius_m, tree.top_radius_m))
-        solids += [ellipsoid_solid(crown.centre, crown.radii) for crown in forest.crowns(tree)]
+        solids += [ellipsoid_solid(centre, radii) for centre, radii in tree.crowns()]
     discs = []
     for tree in trees:
-        share = height_m / tree.height_m
-        middle = tree.base + share * (tree.top - tree.base)
-        radius = tree.radius_m + share * (tree.top_radius_m - tree.radius_m)
-        discs.append(Disc(float(middle[0]), float(middle[1]), radius))
+        middle = tree.base + height_m / tree.height_m * (tree.top - tree.base)
+        discs.append(Disc(float(middle[0]), float(middle[1]), tree.radius_at_m(height_m)))
     start, goal = (0.0, 0.0, -height_m), (world.course_m, 0.0, -height_m)
     return World(scene, CollisionWorld(solids), start, goal, tuple(discs))
