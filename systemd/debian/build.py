@@ -97,7 +97,7 @@ def build(out: Path, *, libraries: bool) -> Path:
         lay_out(stage, libraries=libraries)
         architecture = write_control(stage, libraries=libraries)
         package = out / f"morpheyes_{PROJECT['version']}_{architecture}.deb"
-        command = ["dpkg-deb", "--root-owner-group", "-Zxz", "--build", str(stage), str(package)]
+        command = ["dpkg-deb", "--root-owner-group", "-Zzstd", "-z6", "--build", str(stage), str(package)]
         subprocess.run(command, check=True, capture_output=True)
     return package
 
