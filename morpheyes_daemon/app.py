@@ -24,6 +24,8 @@ from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
 from morpheyes_daemon.devices.camera import Camera
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.devices.servo import Servo
+from morpheyes_daemon.doctor.findings import Finding, Severity
+from morpheyes_daemon.doctor.parameter_rules import examine_parameters
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages import Event, Perception, VehicleState
 from morpheyes_daemon.perception import VisionJob, build_strategy
@@ -87,6 +89,7 @@ class Daemon:
         self.hub.on_vehicle(self._on_vehicle)
         events.subscribe(self._on_event)
         self.hub.parameters.on_change(self._on_parameters)
+        self._stops: tuple[str, ...] = ()
         self.supervisor = Supervisor(
             self._tasks(), self.guardian, events, parts.clock, config.safety.supervisor_timeout_s
         )
@@ -207,16 +210,26 @@ class Daemon:
             self.guardian.alarm(event.reason, event.t_ns)
 
     def _on_parameters(self, values: Mapping[str, float]) -> None:
-        """The autopilot's own numbers, new: how it flies and where its sticks end."""
+        """The autopilot's own numbers, new: how it flies, where its sticks end, and whether it may be flown."""
+        self._heed_doctor(examine_parameters(values, self.config))
         try:
             model = LoiterModel.from_parameters(values)
             limits = StickLimits(model.minimum, model.maximum, model.neutral)
-        except DeviceError as error:
-            self.events.publish(Event(self._clock.now_ns(), "autopilot", Reason.DOCTOR_SAYS_NO, str(error)))
-            return
+        except DeviceError:
+            return  # the doctor has just said so
         lean_rad = min(self.config.safety.max_lean_deg * 0.0174533, model.lean_max_rad)
         self.control = FlightControl(model, self._governor, VelocityTuning(max_lean_rad=lean_rad))
         self.gate.set_limits(limits)
+
+    def _heed_doctor(self, findings: list[Finding]) -> None:
+        """A finding that says do not fly keeps us from engaging; a flight that is under way is not ended by it."""
+        stops = tuple(finding.id for finding in findings if finding.severity is Severity.STOP)
+        self.guardian.set_missing(Reason.DOCTOR_SAYS_NO if stops else None, "doctor")
+        for finding in findings:
+            if finding.id in stops and finding.id not in self._stops:
+                text = f"{finding.id}: {finding.evidence}; {finding.risk}; {finding.remedy}"
+                self.events.publish(Event(self._clock.now_ns(), "doctor", Reason.DOCTOR_SAYS_NO, text))
+        self._stops = stops
 
     def _output(self, out: GateOutput) -> None:
         """The gate's output, in the order of the radio's channels."""

@@ -95,7 +95,7 @@ class Guardian:
         self.machine = Machine()
         self._limits = limits
         self._on_transition = on_transition
-        self._missing: Reason | None = Reason.STARTED
+        self._missing: dict[str, Reason] = {"": Reason.STARTED}
         self._faults: dict[tuple[Reason, str], None] = {}
         self._vehicle = VehicleState()
         self._switch = EngageSwitch(limits.engage_above_us, round(limits.switch_timeout_s * S))
@@ -120,7 +120,12 @@ class Guardian:
     @property
     def missing(self) -> Reason | None:
         """What keeps the daemon from being ready as far as `set_missing` said, None when nothing does."""
-        return self._missing
+        return next(iter(self._missing.values()), None)
+
+    @property
+    def since_ns(self) -> int:
+        """When the present state was entered."""
+        return self.machine.since_ns
 
     # -- what is heard ------------------------------------------------------------------------------------------
 
@@ -145,9 +150,12 @@ class Guardian:
         """All tasks have been started."""
         self._fire(Trigger.BOOTED, Reason.STARTED, now_ns)
 
-    def set_missing(self, reason: Reason | None) -> None:
-        """Say what still keeps the daemon from being ready (None: nothing)."""
-        self._missing = reason
+    def set_missing(self, reason: Reason | None, source: str = "") -> None:
+        """Say what, as far as `source` knows, still keeps the daemon from being ready (None: nothing)."""
+        if reason is None:
+            self._missing.pop(source, None)
+        else:
+            self._missing[source] = reason
 
     def fault(self, reason: Reason, now_ns: int, source: str = "") -> None:
         """A part failed: neutral on the spot, and stay stopped until the pilot engages anew.
@@ -254,8 +262,8 @@ class Guardian:
             self._try_engage(now_ns)
 
     def _missing_on_ground(self, now_ns: int) -> Reason | None:
-        if self._missing is not None:
-            return self._missing
+        if self.missing is not None:
+            return self.missing
         if not self.gate.has_limits:
             return Reason.PARAMETERS_UNKNOWN
         lease = self.gate.stale(now_ns)

@@ -1,7 +1,7 @@
 """The supervisor owns every task: starts them, restarts what dies with back-off, and says so to the guardian.
 
-It also renews the gate's SUPERVISOR lease, so that a supervisor that no longer runs means neutral sticks. It does
-not judge flight; that is the guardian's.
+It also renews the gate's SUPERVISOR lease, so that a supervisor that no longer runs means neutral sticks. A part
+that has never worked yet is missing; one that worked and died is a fault. Flight is judged by the guardian.
 """
 
 from __future__ import annotations
@@ -66,6 +66,11 @@ class Supervisor:
         self._clock = clock
         self._lease_ns = round(lease_s * S)
 
+    def add(self, task: Task) -> None:
+        """Take one more task, before `run`."""
+        self.tasks.append(task)
+        self.pulses[task.name] = Pulse(self._clock)
+
     async def run(self) -> None:
         """Keep every task running; returns only by cancellation, with every task ended."""
         async with asyncio.TaskGroup() as group:
@@ -100,7 +105,9 @@ class Supervisor:
         now_ns = self._clock.now_ns()
         if pulse.on_first is None:
             self._events.publish(Event(now_ns, task.name, task.fault, text))
-        if task.essential:
+        if task.essential and pulse.count == 0:
+            self._guardian.set_missing(task.fault, task.name)
+        elif task.essential:
             self._guardian.fault(task.fault, now_ns, task.name)
         pulse.on_first = lambda: self._recovered(task)
 
@@ -108,4 +115,5 @@ class Supervisor:
         now_ns = self._clock.now_ns()
         self._events.publish(Event(now_ns, task.name, Reason.RECOVERED, f"{task.name}: works again"))
         if task.essential:
+            self._guardian.set_missing(None, task.name)
             self._guardian.clear(task.fault, now_ns, task.name)

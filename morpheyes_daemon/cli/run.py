@@ -1,0 +1,39 @@
+"""`morpheyes run`: the daemon on the vehicle; systemd starts it like this."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    config: Annotated[Path | None, typer.Option("--config", help="The vehicle; none: ./config.yaml.")] = None,
+    mission: Annotated[
+        str | None, typer.Option("--mission", help="Mission by name or path, instead of the configured one.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="Calibration file, instead of the configured one.")
+    ] = None,
+) -> None:
+    """Run the daemon until Ctrl-C or SIGTERM; what is missing is waited for, and said on standard error.
+
+    It never arms and never takes off. It ends in neutral, then release; a second Ctrl-C releases at once.
+    """
+    import asyncio
+
+    from morpheyes_daemon.service import calibration_file, event_loop, serve
+    from morpheyes_daemon.shipped import find_mission, load_config, load_mission
+
+    vehicle = load_config(config)
+    if calibration is not None:
+        vehicle = vehicle.model_copy(update={"calibration": calibration})
+    name = mission or vehicle.mission
+    file = load_mission(name)
+    calibration_file(vehicle)
+    with asyncio.Runner(loop_factory=event_loop()) as runner:
+        try:
+            runner.run(serve(vehicle, find_mission(name).stem, file, lambda line: typer.echo(line, err=True)))
+        except asyncio.CancelledError:
+            raise typer.Exit(130) from None

@@ -1,0 +1,224 @@
+"""The daemon on real devices, as systemd or a person starts it: parts, flight log, page, mavsdk, systemd and signals.
+
+What is not connected is waited for in PREFLIGHT. Everything that decides about flight is in app.py and below it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from morpheyes_daemon import __version__
+from morpheyes_daemon.app import Daemon, Parts
+from morpheyes_daemon.bus import EventLog, Topics
+from morpheyes_daemon.clock import Clock, running_clock, wall_time_s
+from morpheyes_daemon.config import MissionFile, VehicleConfig
+from morpheyes_daemon.dashboard.server import Dashboard
+from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
+from morpheyes_daemon.devices.camera import build_camera
+from morpheyes_daemon.devices.link import open_link
+from morpheyes_daemon.devices.servo import build_servo
+from morpheyes_daemon.doctor.findings import Severity
+from morpheyes_daemon.doctor.rig import examine_calibration
+from morpheyes_daemon.errors import CalibrationError
+from morpheyes_daemon.messages import Event
+from morpheyes_daemon.perception import PipelineFactory
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.recorder.flight_log import flight_header, flight_path
+from morpheyes_daemon.recorder.recorder import Recorder
+from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.supervisor.sd_notify import notify
+from morpheyes_daemon.supervisor.supervisor import Pulse, Task
+from morpheyes_daemon.supervisor.worker_process import ProcessWorker
+from morpheyes_daemon.tasks.health import Health
+
+JOB_TIMEOUT_S = 2.0
+"""A frame that takes longer than this is lost, and the worker with it."""
+DASHBOARD_IMAGE_HZ = 2.0
+STICKS_SILENT_S = 1.0
+"""The stick task steps fifty times a second, whatever the state."""
+CAMERA_ALIVE_S = 2.0
+VISION_SILENT_S = 30.0
+"""Longer than it takes to kill a hung vision worker and to start another; killing the daemon for it mends nothing."""
+
+Say = Callable[[str], None]
+
+
+def calibration_file(config: VehicleConfig) -> Path:
+    """Return the configured calibration; raises CalibrationError when it does not fit the rig."""
+    if config.calibration is None:
+        raise CalibrationError(
+            "calibration is not set: make a file with `morpheyes calibrate solve` and name it in config.yaml, "
+            "or give --calibration FILE."
+        )
+    rig = RigModel.load(config.calibration).rescaled(config.camera.width_px, config.camera.height_px)
+    for baseline_m in config.baseline_range_m:
+        rig.T_cam0_cam1(baseline_m)
+    return config.calibration
+
+
+def build_parts(
+    config: VehicleConfig,
+    mission: MissionFile,
+    clock: Clock,
+    events: EventLog,
+    tell: Callable[[Health], None] = lambda report: None,
+    film: bool = False,
+) -> Parts:
+    """Return the real devices and the vision worker, nothing open yet; `film` keeps a picture of every frame.
+
+    Raises ConfigError or CalibrationError.
+    """
+    pipeline = PipelineFactory(config, mission, calibration_file(config))
+    log_hz = config.recorder.image_rate_hz if config.recorder.images else 0.0
+    log_hz = config.camera.rate_hz if film else log_hz
+    page_hz = DASHBOARD_IMAGE_HZ if config.dashboard.enabled else 0.0
+    return Parts(
+        clock=clock,
+        camera=build_camera(config.camera, clock),
+        servo=build_servo(config.servo, open_link, clock, events),
+        opener=open_link,
+        worker=ProcessWorker(pipeline, job_timeout_s=JOB_TIMEOUT_S),
+        image_rate_hz=max(log_hz, page_hz),
+        tell=tell,
+    )
+
+
+async def serve(config: VehicleConfig, mission_name: str, mission: MissionFile, say: Say) -> None:
+    """Run until SIGINT or SIGTERM; `say` gets one line for every change."""
+    clock, topics, events = running_clock(), Topics.create(), EventLog()
+    began_ns = clock.now_ns()
+    events.subscribe(lambda event: say(event_line(event, began_ns)))
+    systemd = SystemdReport()
+    daemon = Daemon(config, mission, build_parts(config, mission, clock, events, systemd.tell), topics, events)
+    for task in _companions(daemon, mission_name, clock):
+        daemon.supervisor.add(task)
+    stop = asyncio.Event()
+    with ending_by_signal(stop), closing(_recorder(daemon, mission_name, mission, clock)) as recorder:
+        say(f"mission {mission_name}, calibration {config.calibration}, log {recorder.path}")
+        _heed_calibration(daemon, clock)
+        await daemon.run(stop)
+        notify("STOPPING=1")
+
+
+def event_loop() -> Callable[[], asyncio.AbstractEventLoop] | None:
+    """Return what makes uvloop's event loop where it is installed, else None for asyncio's own."""
+    try:
+        import uvloop
+    except ModuleNotFoundError:
+        return None
+    made: Callable[[], asyncio.AbstractEventLoop] = uvloop.new_event_loop
+    return made
+
+
+def event_line(event: Event, began_ns: int) -> str:
+    """Return an event as a line for a person; what repeats the reason is left out."""
+    seconds = (event.t_ns - began_ns) / 1e9
+    text = event.text if event.reason.text in event.text else f"{event.reason.text}; {event.text}".rstrip("; ")
+    return f"{seconds:9.2f} s  {event.source:<10} {text}"
+
+
+@contextmanager
+def ending_by_signal(stop: asyncio.Event) -> Iterator[None]:
+    """The first SIGINT or SIGTERM asks for neutral, then release; a second one for release at once."""
+    loop, main = asyncio.get_running_loop(), asyncio.current_task()
+    assert main is not None
+
+    def end() -> None:
+        if stop.is_set():
+            main.cancel()
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, end)
+    try:
+        yield
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)
+
+
+class SystemdReport:
+    """READY once, STATUS at every change, WATCHDOG while the chain turns."""
+
+    def __init__(self, send: Callable[[str], bool] = notify) -> None:
+        self._send = send
+        self._status = ""
+
+    def tell(self, report: Health) -> None:
+        """Take a health report, four times a second."""
+        status = f"STATUS={report.state}: {report.reason.text}"
+        words = [] if self._status else ["READY=1"]
+        if status != self._status:
+            self._status = status
+            words.append(status)
+        if chain_turns(report):
+            words.append("WATCHDOG=1")
+        if words:
+            self._send("\n".join(words))
+
+
+def chain_turns(report: Health) -> bool:
+    """Whether what only a restart could mend still works: sticks step, and a living camera leads to depth.
+
+    A device that is away and a vision worker that is being replaced are no reason to be killed, in flight least.
+    """
+    ages = report.ages_s
+    if not ages["gate"] <= STICKS_SILENT_S:
+        return False
+    camera_lives = ages["frame"] <= CAMERA_ALIVE_S
+    return not (camera_lives and ages["perception"] > VISION_SILENT_S)
+
+
+def _heed_calibration(daemon: Daemon, clock: Clock) -> None:
+    """What the doctor says against the calibration keeps the daemon from engaging."""
+    findings, _ = examine_calibration(daemon.config)
+    for finding in findings:
+        if finding.severity is Severity.STOP:
+            daemon.guardian.set_missing(Reason.DOCTOR_SAYS_NO, "calibration")
+            text = f"{finding.id}: {finding.evidence}; {finding.remedy}"
+            daemon.events.publish(Event(clock.now_ns(), "doctor", Reason.DOCTOR_SAYS_NO, text))
+
+
+def _recorder(daemon: Daemon, mission_name: str, mission: MissionFile, clock: Clock) -> Recorder:
+    config = daemon.config
+    header = flight_header(
+        mission=mission_name,
+        mission_file=mission,
+        config=config,
+        calibration_hash=RigModel.load(calibration_file(config)).hash,
+        wall_s=wall_time_s(),
+    )
+    return Recorder(
+        daemon.topics,
+        daemon.events,
+        clock,
+        flight_path(config.recorder.folder, mission_name, wall_time_s()),
+        header,
+        image_rate_hz=config.recorder.image_rate_hz if config.recorder.images else None,
+        threaded=True,
+    )
+
+
+def _companions(daemon: Daemon, mission_name: str, clock: Clock) -> list[Task]:
+    """Tasks without which it flies as well: the page and mavsdk."""
+    config, tasks = daemon.config, []
+    if config.dashboard.enabled:
+        identity = {"mission": mission_name, "version": __version__, "calibration": str(config.calibration)}
+        page = Dashboard(daemon.topics, daemon.events, clock, identity)
+
+        async def show(pulse: Pulse) -> None:
+            await page.run(config.dashboard)
+
+        tasks.append(Task("dashboard", show, Reason.TASK_DIED, essential=False))
+    if config.autopilot.mavsdk:
+        bridge = MavsdkBridge(daemon.hub, config.autopilot, clock)
+
+        async def listen(pulse: Pulse) -> None:
+            await bridge.run()
+
+        tasks.append(Task("mavsdk", listen, Reason.TASK_DIED, essential=False))
+    return tasks
