@@ -1,0 +1,79 @@
+"""Configuration and mission files: strict, and every error names file, line, key, what was found, what is allowed."""
+
+from pathlib import Path
+
+import pytest
+
+from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.errors import ConfigError
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.shipped import load_config, load_mission, mission_names, shipped
+from morpheyes_daemon.yaml_source import parse_model
+
+GOOD = "camera: {backend: v4l2}\nservo: {backend: serial}\n"
+
+
+def errors(text: str) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        parse_model(text, VehicleConfig, "config.yaml")
+    return str(caught.value).splitlines()
+
+
+def test_the_shipped_files_are_good() -> None:
+    assert load_config(shipped("config.yaml")).mission == "forest"
+    assert "forest" in mission_names()
+    for name in mission_names():
+        assert load_mission(name).strategy
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "words"),
+    [
+        (GOOD + "foo: 1\n", 3, ["foo", "there is no such key"]),
+        ("camera:\n  backend: v4l2\n  width_px: 12\nservo: {backend: none}\n", 3, ["camera.width_px", "12", "160"]),
+        ("camera: {backend: webcam}\nservo: {backend: none}\n", 1, ["camera", "webcam", "v4l2"]),
+        ("camera: {backend: v4l2}\n", 1, ["servo", "missing"]),
+        (GOOD + "safety:\n  dead_daemon_s: soon\n", 4, ["safety.dead_daemon_s", "'soon'", "number"]),
+        (GOOD + "safety:\n  dead_daemon_s: .nan\n", 4, ["safety.dead_daemon_s", "finite"]),
+        ("camera: [1, 2\n", 2, ["not valid YAML"]),
+    ],
+)
+def test_errors_name_line_key_and_bounds(text: str, line: int, words: list[str]) -> None:
+    first = errors(text)[0]
+    assert first.startswith(f"config.yaml:{line}:")
+    for word in words:
+        assert word in first
+
+
+def test_every_wrong_key_is_told_at_once() -> None:
+    assert len(errors(GOOD + "foo: 1\nbar: 2\nmission: ''\n")) == 3
+
+
+def test_baselines_must_be_in_order() -> None:
+    text = "camera: {backend: v4l2}\nservo:\n  backend: serial\n  motion: {min_baseline_mm: 300, max_baseline_mm: 100}\n"
+    assert "min_baseline_mm must be less than" in errors(text)[0]
+
+
+def test_a_missing_file_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="there is no such file"):
+        load_config(tmp_path / "nowhere.yaml")
+
+
+def test_an_unknown_strategy_names_line_and_choices(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("description: x\nstrategy: florest\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"mine.yaml:2: strategy: .*florest.*forest"):
+        load_mission(str(path))
+
+
+def test_a_strategys_parameters_are_checked_in_their_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("strategy: forest\nparameters:\n  margin_m: 9\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"mine.yaml:3: parameters.margin_m: found 9"):
+        load_mission(str(path))
+
+
+def test_reason_numbers_are_used_once() -> None:
+    numbers = [reason.number for reason in Reason]
+    assert len(numbers) == len(set(numbers))
+    assert all(reason.text for reason in Reason)

@@ -1,0 +1,86 @@
+"""The governor: whatever it is told, the vehicle can stop within what it has seen and can trust."""
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from morpheyes_daemon.control.governor import Governor, GovernorLimits, trust_range_m
+from morpheyes_daemon.control.loiter import LoiterModel
+from morpheyes_daemon.messages import DepthSummary, Intent, MissionCommand, VehicleState
+from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED, ParameterTable
+
+MODEL = LoiterModel.from_parameters(dict(ParameterTable(RECOMMENDED)))
+LIMITS = GovernorLimits(
+    dead_daemon_s=1.0,
+    depth_sigmas=3.0,
+    max_relative_depth_error=0.2,
+    max_speed_m_s=4.0,
+    sync_error_s=0.002,
+    image_width_px=320,
+)
+SEEN = DepthSummary(1, 0, 0, 0.2, 0.0005, 370.0, 0.8, 0.25, 0.9, 0.9, 0.0, 2.0, 0.02, "hash")
+
+
+def command(clear_m: float, speed: float = 4.0) -> MissionCommand:
+    return MissionCommand(
+        1, 0, 10**9, Intent.FLY, None, (speed, 0.0, 0.0), 0.0, 1.5, 0.2, clear_m, 0, (0.0, 0.0, -1.5), clear_m
+    )
+
+
+def flying(speed: float, flown_m: float = 0.0) -> VehicleState:
+    return VehicleState(p_ned_m=(flown_m, 0.0, -1.5), v_ned_m_s=(speed, 0.0, 0.0), height_m=1.5)
+
+
+@given(st.floats(0.0, 40.0), st.floats(0.0, 5.0), st.floats(0.0, 6.0))
+def test_it_always_leaves_room_to_stop_after_the_daemons_death(clear: float, speed: float, flown: float) -> None:
+    governed = Governor(LIMITS).limit(command(clear), SEEN, flying(speed, flown), MODEL, 1.5, 0)
+    if governed.limit_m_s > 0.0:
+        needed = MODEL.stopping_distance_m(governed.limit_m_s, 1.5, LIMITS.dead_daemon_s)
+        assert needed <= min(clear, governed.trust_m) - flown + 1e-6
+
+
+@given(st.floats(0.0, 12.0), st.floats(0.0, 4.0))
+def test_a_stick_held_by_a_dead_daemon_still_leaves_room_to_stop(clear: float, speed: float) -> None:
+    governed = Governor(LIMITS).limit(command(clear), SEEN, flying(speed), MODEL, 1.5, 0)
+    u, tau = governed.stick_limit_m_s, MODEL.time_constant_s(1.5)
+    if u <= 0.0:
+        return
+    kept = math.exp(-LIMITS.dead_daemon_s / tau)
+    way = u * LIMITS.dead_daemon_s + (speed - u) * tau * (1 - kept)
+    after = u + (speed - u) * kept
+    assert way + MODEL.stopping_distance_m(after, 1.5) <= clear + 1e-6
+
+
+@given(st.floats(0.0, 30.0), st.floats(0.0, 5.0))
+def test_more_room_never_means_slower(clear: float, more: float) -> None:
+    governor = Governor(LIMITS)
+    less = governor.limit(command(clear), SEEN, flying(1.0), MODEL, 1.5, 0).limit_m_s
+    assert governor.limit(command(clear + more), SEEN, flying(1.0), MODEL, 1.5, 0).limit_m_s >= less - 1e-9
+
+
+@pytest.mark.parametrize("clear", [math.nan, -math.inf, -1.0, 0.0])
+def test_nonsense_and_no_room_mean_standing_still(clear: float) -> None:
+    governed = Governor(LIMITS).limit(command(clear), SEEN, flying(1.0), MODEL, 1.5, 0)
+    assert governed.limit_m_s == 0.0
+    assert governed.stick_limit_m_s < 0.01
+
+
+def test_trust_ends_where_three_sigmas_are_a_fifth_of_the_depth() -> None:
+    z = trust_range_m(SEEN, 3.0, 0.2)
+    sigma = math.hypot(z * z * 0.25 / (0.2 * 370.0), z * 0.0005 / 0.2)
+    assert 3.0 * sigma / z == pytest.approx(0.2, rel=1e-9)
+
+
+def test_a_baseline_nobody_knows_is_trusted_nowhere() -> None:
+    assert trust_range_m(replace(SEEN, baseline_sigma_m=0.05), 3.0, 0.2) == 0.0
+
+
+def test_time_between_the_eyes_slows_down_near_obstacles() -> None:
+    slow = Governor(replace(LIMITS, sync_error_s=0.02))
+    governed = slow.limit(replace(command(40.0), z_close_m=2.0), SEEN, flying(1.0), MODEL, 1.5, 0)
+    assert governed.bound == "sync"
+    d = 0.2 * 370.0 / 2.0
+    assert governed.limit_m_s == pytest.approx(min(2.0 / (160 + d + 1), 2.0 / 370.0) / 0.02, rel=1e-6)
