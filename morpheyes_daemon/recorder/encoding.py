@@ -1,8 +1,8 @@
 """Messages to plain JSON values and back, for any dataclass, so that a new message is logged without new code.
 
-Not a number is null, infinities are the strings "inf" and "-inf", since JSON has neither. Rows of up to 64
-numbers are lists that a viewer can plot, other arrays a block of base64 with their shape. A value whose field does not say its type carries
-it under "_type". Camera images are left out: the log keeps them apart, small and compressed.
+Not a number is null, infinities are the strings "inf" and "-inf", since JSON has neither. Rows of up to 64 numbers
+are lists that a viewer can plot, other arrays a block of base64 with their shape. A value whose field does not say
+its type carries it under "_type". Camera images are left out: the log keeps them apart, small and compressed.
 """
 
 from __future__ import annotations
