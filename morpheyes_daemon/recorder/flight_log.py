@@ -28,14 +28,13 @@ LIBRARY = f"morpheyes {__version__}"
 
 
 def flight_path(folder: Path, mission: str, wall_s: float) -> Path:
-    """Return flights/2026-05-01T12-30-00Z_forest.mcap, with a number when that is taken."""
+    """Return flights/2026-05-01T12-30-00Z_forest.mcap, with a number when that is taken.
+
+    A relative `folder` lies below the LOGS_DIRECTORY that systemd names, if it does.
+    """
+    folder = Path(os.environ.get("LOGS_DIRECTORY", "")) / folder
     stamp = datetime.fromtimestamp(wall_s, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
     return _free_name(folder / f"{stamp}_{Path(mission).stem}.mcap")
-
-
-def flights_folder(folder: Path) -> Path:
-    """Return where flights go: `folder`, and for a relative one below the LOGS_DIRECTORY that systemd names."""
-    return Path(os.environ.get("LOGS_DIRECTORY", "")) / folder
 
 
 def flight_header(

@@ -13,7 +13,7 @@ from morpheyes_daemon.clock import MonotonicClock, S
 from morpheyes_daemon.config import MissionFile, NoServoConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.messages import Event, Sticks
 from morpheyes_daemon.reasons import Reason
-from morpheyes_daemon.recorder.flight_log import CHUNK_BYTES, flight_header, flight_path, flights_folder
+from morpheyes_daemon.recorder.flight_log import CHUNK_BYTES, flight_header, flight_path
 from morpheyes_daemon.recorder.reader import Flight, read_flight
 from morpheyes_daemon.recorder.recorder import QUEUE_LIMIT, Recorder
 from tests.hand_clock import HandClock
@@ -151,10 +151,10 @@ def test_names_are_the_time_and_the_mission_and_never_taken_twice(tmp_path: Path
 
 def test_flights_go_where_systemd_says_unless_the_folder_is_absolute(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("LOGS_DIRECTORY", raising=False)
-    assert flights_folder(Path("flights")) == Path("flights")
+    assert flight_path(Path("flights"), "forest", 0.0).parent == Path("flights")
     monkeypatch.setenv("LOGS_DIRECTORY", "/var/log/morpheyes")
-    assert flights_folder(Path("flights")) == Path("/var/log/morpheyes/flights")
-    assert flights_folder(Path("/data")) == Path("/data")
+    assert flight_path(Path("flights"), "forest", 0.0).parent == Path("/var/log/morpheyes/flights")
+    assert flight_path(Path("/data"), "forest", 0.0).parent == Path("/data")
 
 
 def real_time_recorder(topics: Topics, events: EventLog, path: Path) -> Recorder:
