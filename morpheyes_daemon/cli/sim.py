@@ -64,9 +64,7 @@ def command(
         )
     folder = out or Path("out") / f"{plan.mission_name}-{seed}"
     if realtime or autopilot:
-        from morpheyes_daemon.experiments.realtime import fly_realtime
-
-        summary = fly_realtime(plan, folder, autopilot, quiet=as_json)
+        summary = _fly_realtime(plan, folder, autopilot, quiet=as_json)
     else:
         summary = _fly_lockstep(plan, folder, quiet=as_json)
     typer.echo(json.dumps(summary.as_json(), indent=2) if as_json else _page(summary, folder))
@@ -88,6 +86,14 @@ def _fly_lockstep(plan: FlightPlan, folder: Path, quiet: bool) -> Summary:
         line.say("drawing the pictures")
         outputs.finish(summary)
     return summary
+
+
+def _fly_realtime(plan: FlightPlan, folder: Path, autopilot: str | None, quiet: bool) -> Summary:
+    from morpheyes_daemon.cli.flight_line import FlightLine
+    from morpheyes_daemon.experiments.realtime import fly_realtime
+
+    with FlightLine(quiet) as line:
+        return fly_realtime(plan, folder, autopilot, line.show)
 
 
 def _page(summary: Summary, folder: Path) -> str:

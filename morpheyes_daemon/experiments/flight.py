@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from morpheyes_daemon.app import Daemon, Parts
 from morpheyes_daemon.bus import EventLog, Topics
@@ -20,7 +20,7 @@ from morpheyes_daemon.config import AutopilotConfig, MissionFile, SerialServoCon
 from morpheyes_daemon.devices.link import Link, LinkOpener, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceNotFoundError
-from morpheyes_daemon.experiments.judge import Judge, Outcome, Verdict
+from morpheyes_daemon.experiments.judge import Judge, Outcome, Reported, Verdict
 from morpheyes_daemon.experiments.stage import Scenario, Stage, StageCamera
 from morpheyes_daemon.messages import StereoFrame
 from morpheyes_daemon.perception import PipelineFactory
@@ -147,10 +147,10 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
         image_rate_hz=watchers.image_rate_hz,
     )
     daemon = Daemon(plan.config, plan.mission, parts, topics, events)
-    tally = _Tally(topics)
+    tally = Tally(topics)
     for attach in watchers.attach:
         attach(daemon, stage)
-    judge = Judge(stage, daemon.guardian, topics, plan.limit_s)
+    judge = Judge(stage, daemon.guardian, topics.gate, plan.limit_s)
     stop = asyncio.Event()
     background = [
         asyncio.create_task(job)
@@ -158,7 +158,7 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     ]
     running = asyncio.create_task(daemon.run(stop))
     watching = asyncio.create_task(judge.watch())
-    conducting = asyncio.create_task(conduct(crew, daemon, clock.sleep_until_ns, clock.now_ns))
+    conducting = asyncio.create_task(conduct(crew, daemon.guardian, clock.sleep_until_ns, clock.now_ns))
     try:
         done, _ = await asyncio.wait({running, watching, conducting}, return_when=asyncio.FIRST_COMPLETED)
         if conducting in done:
@@ -180,22 +180,35 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     return summarize_flight(plan, verdict, tally, simulated_s, stopwatch_s() - started_s)
 
 
+class Crew(Protocol):
+    """The people around a flight."""
+
+    async def take_off(self, height_m: float) -> None:
+        """Arm, climb, hover in Loiter."""
+
+    def engage(self) -> None:
+        """Hand the sticks over."""
+
+    def disengage(self) -> None:
+        """Take them back."""
+
+
 async def conduct(
-    crew: GroundCrew, daemon: Daemon, sleep_until_ns: Callable[[int], Any], now_ns: Callable[[], int]
+    crew: Crew, guardian: Reported, sleep_until_ns: Callable[[int], Any], now_ns: Callable[[], int]
 ) -> None:
     """Take off, wait until the daemon stands by, hand over; raises DeviceNotFoundError when it never gets ready."""
     await crew.take_off(TAKE_OFF_HEIGHT_M)
     limit_ns = now_ns() + round(READY_LIMIT_S * S)
-    while daemon.guardian.state is not State.STANDBY:
+    while guardian.state is not State.STANDBY:
         if now_ns() > limit_ns:
             raise DeviceNotFoundError(
-                f"The daemon did not get ready within {READY_LIMIT_S:.0f} s: {daemon.guardian.reason.text}."
+                f"The daemon did not get ready within {READY_LIMIT_S:.0f} s: {guardian.reason.text}."
             )
         await sleep_until_ns(now_ns() + S // 20)
     crew.engage()
 
 
-class _Tally:
+class Tally:
     """Counts frames and hashes every stick that went out."""
 
     def __init__(self, topics: Topics) -> None:
@@ -225,7 +238,7 @@ class _Tally:
 
 
 def summarize_flight(
-    plan: FlightPlan, verdict: Verdict, tally: _Tally, simulated_s: float, wall_s: float
+    plan: FlightPlan, verdict: Verdict, tally: Tally, simulated_s: float, wall_s: float
 ) -> Summary:
     """Put the judge's verdict and the counts into the row of one flight."""
     hold_mm = plan.config.hold_baseline_mm

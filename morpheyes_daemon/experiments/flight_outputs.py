@@ -17,9 +17,19 @@ from morpheyes_daemon.recorder.pictures.scene import Disc, Scene
 from morpheyes_daemon.recorder.pictures.strips import draw_strips
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.series import FlightSeries
+from morpheyes_daemon.simulation.worlds import World
 from morpheyes_daemon.stereo.rig import RigModel
 
 FILES = ("summary.json", "flight.mcap", "map.png", "strips.png", "flight.mp4")
+
+
+def scene_of(world: World) -> Scene:
+    """Return what the top view shows of a world."""
+    return Scene(
+        discs=tuple(Disc(disc.x_m, disc.y_m, disc.radius_m) for disc in world.discs),
+        start_m=world.start_ned_m[:2],
+        goal_m=world.goal_ned_m[:2],
+    )
 
 
 class FlightOutputs:
@@ -63,11 +73,7 @@ class FlightOutputs:
         for name in FILES:
             (self._folder / name).unlink(missing_ok=True)
         world, plan = stage.world, self._plan
-        self._scene = Scene(
-            discs=tuple(Disc(disc.x_m, disc.y_m, disc.radius_m) for disc in world.discs),
-            start_m=world.start_ned_m[:2],
-            goal_m=world.goal_ned_m[:2],
-        )
+        self._scene = scene_of(world)
         header = flight_header(
             mission=plan.mission_name,
             mission_file=plan.mission,

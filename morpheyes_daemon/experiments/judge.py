@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Protocol
 
-from morpheyes_daemon.bus import Topics
+from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.clock import S, Ticker
 from morpheyes_daemon.experiments.stage import Stage
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.guardian import NOT_RESUMED, Guardian
+from morpheyes_daemon.safety.guardian import NOT_RESUMED
 from morpheyes_daemon.safety.states import State
 
 RATE_HZ = 50.0
@@ -46,10 +47,26 @@ class Verdict:
     braking_events: int
 
 
+class Reported(Protocol):
+    """What the daemon says of itself: its guardian, or what was heard of it in another process."""
+
+    @property
+    def state(self) -> State:
+        """Its state."""
+
+    @property
+    def reason(self) -> Reason:
+        """Why it is in it."""
+
+    @property
+    def since_ns(self) -> int:
+        """Since when."""
+
+
 class Judge:
     """Watches one flight."""
 
-    def __init__(self, stage: Stage, guardian: Guardian, topics: Topics, limit_s: float) -> None:
+    def __init__(self, stage: Stage, guardian: Reported, gate: Latest[GateOutput], limit_s: float) -> None:
         self._stage = stage
         self._guardian = guardian
         self._limit_s = limit_s
@@ -61,7 +78,7 @@ class Judge:
         self._baselines = (math.inf, -math.inf)
         self._braking = 0
         self._state: State | None = None
-        topics.gate.tap(self._count)
+        gate.tap(self._count)
 
     async def watch(self) -> Verdict:
         """Return the verdict as soon as the flight is decided."""
@@ -105,7 +122,7 @@ class Judge:
             return Outcome.ABORTED, f"believed to be at the goal, {off_m:.1f} m from it"
         if reason is Reason.MISSION_REFUSED:
             return Outcome.REFUSED, reason
-        if reason not in NOT_RESUMED and now_ns - self._guardian.machine.since_ns > GIVEN_UP_S * S:
+        if reason not in NOT_RESUMED and now_ns - self._guardian.since_ns > GIVEN_UP_S * S:
             return Outcome.ABORTED, reason
         return None
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 from morpheyes_daemon.clock import MS, Clock, S
 from morpheyes_daemon.config import NoServoConfig, VehicleConfig
@@ -16,6 +18,7 @@ from morpheyes_daemon.messages import RawPair
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.collision import VehicleShape
+from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.renderer import Renderer
 from morpheyes_daemon.simulation.rig_twin import RigTwin
 from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
@@ -45,17 +48,34 @@ class Scenario:
     sensor: Sensor = Sensor()
 
 
-class Stage:
-    """One simulated flight's truth."""
+class FlyingVehicle(Protocol):
+    """What flies: the autopilot twin with its vehicle, or a simulator of somebody else's."""
 
-    def __init__(self, scenario: Scenario, config: VehicleConfig, clock: Clock, render_threads: int = 1) -> None:
+    radio: Radio
+
+    def truth_at(self, t_ns: int) -> Truth:
+        """Return where the vehicle was; InputError when that is not known."""
+
+
+class Stage:
+    """One simulated flight's truth; `vehicle` takes the place of the autopilot twin."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        config: VehicleConfig,
+        clock: Clock,
+        render_threads: int = 1,
+        vehicle: FlyingVehicle | None = None,
+    ) -> None:
         seed = scenario.seed
         self.clock = clock
         self.world: World = build_world(load_world(scenario.world), seed)
         wind = WindConditions(scenario.wind_m_s, random.Random(f"wind from {seed}").uniform(-math.pi, math.pi))
         north, east, _ = self.world.start_ned_m
         self.autopilot = AutopilotTwin(Vehicle(wind=wind, seed=seed, start_ned_m=(north, east)), clock, seed=seed)
-        self.radio = self.autopilot.radio
+        self.vehicle: FlyingVehicle = vehicle or self.autopilot
+        self.radio = self.vehicle.radio
         self.teensy = TeensyTwin(_servo_truth(config), clock, seed)
         self._fixed_m = config.servo.baseline_mm / 1e3 if isinstance(config.servo, NoServoConfig) else None
         self.rig = RigTwin(config.camera.width_px, config.camera.height_px, scenario.rig_seed)
@@ -72,7 +92,7 @@ class Stage:
 
     def truth(self, t_ns: int) -> Truth:
         """Where the vehicle really was."""
-        return self.autopilot.truth_at(t_ns)
+        return self.vehicle.truth_at(t_ns)
 
     def clearance_m(self, t_ns: int) -> float:
         """Distance from hull and bar to the nearest obstacle, ground aside; negative is a collision."""
@@ -83,7 +103,12 @@ class Stage:
 
     def expose(self, seq: int, t_ns: int) -> RawPair:
         """Take a stereo pair at `t_ns`, which must lie a sync offset in the past."""
-        return self.camera.render_pair(t_ns, seq, self._pose_at, self.baseline_m(t_ns))
+        return self.exposure(seq, t_ns)()
+
+    def exposure(self, seq: int, t_ns: int) -> Callable[[], RawPair]:
+        """Return what renders the pair of `t_ns`; it may be called in another thread."""
+        baseline_m = self.baseline_m(t_ns)
+        return lambda: self.camera.render_pair(t_ns, seq, self._pose_at, baseline_m)
 
     @property
     def delivery_ns(self) -> int:

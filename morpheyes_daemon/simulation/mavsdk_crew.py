@@ -10,8 +10,10 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from types import TracebackType
 from typing import Any
 
@@ -34,9 +36,10 @@ logger = logging.getLogger(__name__)
 SITL_RC_PORT = 5501
 """ArduPilot SITL takes 8 or 16 little-endian uint16 pulse widths here (plus 10 per instance)."""
 
-_ARMED, _CUSTOM_MODE = 128, 1
+_ARMED, _CUSTOM_MODE, _REAL32 = 128, 1, 9
 _PREARM_CHECK, _POS_HORIZ_REL = 0x10000000, 0x08
 _SET_MODE, _SET_INTERVAL = 176, 511
+_HEARD = ("HEARTBEAT", "SYS_STATUS", "LOCAL_POSITION_NED", "EKF_STATUS_REPORT", "STATUSTEXT", "PARAM_VALUE")
 _STREAMS_US = {1: 200_000, 32: 50_000, 193: 200_000}
 """SYS_STATUS, LOCAL_POSITION_NED, EKF_STATUS_REPORT."""
 
@@ -73,6 +76,7 @@ class MavsdkCrew:
         self._native: Mavsdk | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self.latest: dict[str, dict[str, Any]] = {}
+        self.parameters: dict[str, float] = {}
 
     async def __aenter__(self) -> MavsdkCrew:
         """Connect; raises DeviceNotFoundError when there is no autopilot."""
@@ -84,7 +88,7 @@ class MavsdkCrew:
             await self._close()
             raise DeviceNotFoundError(f"no autopilot answers at {self._url}; is the simulator running?")
         self._action, self._direct = ActionAsync(system), MavlinkDirectAsync(system)
-        for name in ("HEARTBEAT", "SYS_STATUS", "LOCAL_POSITION_NED", "EKF_STATUS_REPORT", "STATUSTEXT"):
+        for name in _HEARD:
             self._tasks.append(asyncio.create_task(self._listen(name)))
         for message_id, interval_us in _STREAMS_US.items():
             await self._command(_SET_INTERVAL, message_id, interval_us)
@@ -110,9 +114,24 @@ class MavsdkCrew:
         try:
             async for message in stream:
                 if message.system_id == 1 and message.component_id == 1:
-                    self.latest[name] = json.loads(message.fields_json)
+                    fields = json.loads(message.fields_json)
+                    self.latest[name] = fields
+                    if name == "PARAM_VALUE":
+                        self.parameters[fields["param_id"]] = float(fields["param_value"])
         finally:
             await stream.aclose()
+
+    async def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Set parameters by name and wait until the autopilot confirms each; raises DeviceTimeoutError."""
+        for name, value in values.items():
+            fields = {"target_system": 1, "target_component": 1, "param_id": name, "param_value": value}
+            message = {**fields, "param_type": _REAL32}
+            confirmed = partial(self._has_parameter, name, value)
+            await self._until(confirmed, 10.0, f"take {name}", partial(self._send, "PARAM_SET", message))
+
+    def _has_parameter(self, name: str, value: float) -> bool:
+        kept = self.parameters.get(name)
+        return kept is not None and math.isclose(kept, value, rel_tol=1e-5, abs_tol=1e-6)
 
     async def take_off(self, height_m: float) -> None:
         """Arm, climb to `height_m` in GUIDED, hand the vehicle to the pilot in Loiter, sticks centred.

@@ -1,0 +1,172 @@
+"""`morpheyes bench`: how fast and how steady the daemon and the simulator are on this machine."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from morpheyes_daemon.cli.progress import progress_line
+
+if TYPE_CHECKING:
+    from morpheyes_daemon.experiments.bench_vision import Times
+    from morpheyes_daemon.experiments.flight import FlightPlan, Progress
+
+app = typer.Typer(help="Time the sticks, the depth and the renderer on this machine.", no_args_is_help=True)
+
+Size = Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")]
+Repeats = Annotated[int, typer.Option(min=3, help="Timed runs; the first two are warm-up and left out.")]
+Calibration = Annotated[str, typer.Option(help="'solved' from rendered boards, 'exact', or a calibration file.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the figures as JSON and nothing else.")]
+
+LIMIT_P99_S, LIMIT_MAX_S = 0.025, 0.100
+LIMIT_GROWTH_PCT = 5.0
+
+
+@app.command()
+def sticks(
+    minutes: Annotated[float, typer.Option(min=0.1, help="After engaging.")] = 10.0,
+    size: Size = "640x480",
+    rate_hz: Annotated[float, typer.Option(min=0.2, max=60.0, help="Stereo pairs per second.")] = 5.0,
+    calibration: Calibration = "solved",
+    as_json: AsJson = False,
+) -> None:
+    """Measure the time between stick messages in real time under full vision load.
+
+    Exit code 1 when p99 is above 25 ms or any interval above 100 ms.
+    """
+    from morpheyes_daemon.experiments.bench_realtime import bench_sticks
+
+    plan = _plan(size, calibration, rate_hz, minutes)
+    found = _live(as_json, lambda show: bench_sticks(plan, minutes, show))
+    rows = [
+        ("stick messages", f"{found.intervals} in {found.minutes:g} minutes, {found.frames} frames seen"),
+        ("interval", _beat(found.p50_s, found.p99_s, found.max_s)),
+        ("loop lateness", f"{found.worst_lateness_ms:.1f} ms at worst"),
+        ("at the end", found.final_state),
+    ]
+    _say(asdict(found), rows, as_json)
+    if found.p99_s > LIMIT_P99_S or found.max_s > LIMIT_MAX_S:
+        raise typer.Exit(1)
+
+
+@app.command()
+def soak(
+    minutes: Annotated[float, typer.Option(min=0.2, help="After engaging.")] = 60.0,
+    size: Size = "640x480",
+    calibration: Calibration = "solved",
+    as_json: AsJson = False,
+) -> None:
+    """Run in real time for long and look for what grows.
+
+    Exit code 1 when memory grew by 5 % or a task, thread or descriptor leaked.
+    """
+    from morpheyes_daemon.experiments.bench_realtime import bench_soak
+
+    plan = _plan(size, calibration, 5.0, minutes)
+    found = _live(as_json, lambda show: bench_soak(plan, minutes, show))
+    first, last = found.first, found.last
+    rows = [
+        ("daemon, MB", f"{first.daemon_mb:.1f} to {last.daemon_mb:.1f}"),
+        ("worker, MB", f"{first.worker_mb:.1f} to {last.worker_mb:.1f}"),
+        ("memory growth", f"{found.memory_growth_pct:+.1f} %"),
+        ("tasks", f"{first.tasks} to {last.tasks}"),
+        ("threads", f"{first.threads} to {last.threads}"),
+        ("descriptors", f"{first.descriptors} to {last.descriptors}"),
+        ("worker restarts", str(found.worker_restarts)),
+        ("stick interval", f"p99 {found.p99_s * 1e3:.1f} ms, largest {found.max_s * 1e3:.1f} ms"),
+    ]
+    _say(found.as_json(), rows, as_json)
+    leaked = max(found.leaked_tasks, found.leaked_threads, found.leaked_descriptors)
+    if found.memory_growth_pct >= LIMIT_GROWTH_PCT or leaked > 0:
+        raise typer.Exit(1)
+
+
+@app.command()
+def depth(
+    size: Size = "640x480", repeats: Repeats = 30, calibration: Calibration = "exact", as_json: AsJson = False
+) -> None:
+    """Time a depth map beside OpenCV's own matcher on the same pairs."""
+    from morpheyes_daemon.experiments.bench_vision import bench_depth
+
+    plan = _plan(size, calibration, 5.0, 1.0)
+    with progress_line() as report:
+        found = bench_depth(plan, repeats, report)
+    rows = [
+        ("images", f"{found.size}, {found.disparities} disparities"),
+        ("depth map", _times(found.depth)),
+        ("StereoSGBM", _times(found.opencv)),
+        ("ratio", f"{found.ratio:.2f} of the medians"),
+    ]
+    _say(asdict(found), rows, as_json)
+
+
+@app.command()
+def latency(
+    size: Size = "640x480", repeats: Repeats = 50, calibration: Calibration = "exact", as_json: AsJson = False
+) -> None:
+    """Time frames through the vision worker, beside the latency that lockstep reckons with."""
+    from morpheyes_daemon.experiments.bench_vision import bench_latency
+
+    plan = _plan(size, calibration, 5.0, 1.0)
+    with progress_line() as report:
+        found = bench_latency(plan, repeats, report)
+    rows = [
+        ("frame to percept", _times(found.latency)),
+        ("of that computing", _times(found.compute)),
+        ("configured", f"{found.configured_ms:g} ms (stereo.latency_ms)"),
+    ]
+    _say(asdict(found), rows, as_json)
+
+
+@app.command()
+def render(size: Size = "640x480", repeats: Repeats = 20, as_json: AsJson = False) -> None:
+    """Time the simulator's rendering of a stereo pair."""
+    from morpheyes_daemon.experiments.bench_vision import bench_render
+
+    plan = _plan(size, "exact", 5.0, 1.0)
+    with progress_line() as report:
+        found = bench_render(plan, repeats, report)
+    _say({"size": size, **asdict(found)}, [("stereo pair", _times(found))], as_json)
+
+
+def _plan(size: str, calibration: str, rate_hz: float, minutes: float) -> FlightPlan:
+    from morpheyes_daemon.experiments.plan import make_plan
+
+    with progress_line() as report:
+        return make_plan(
+            "forest",
+            size=size,
+            calibration=calibration,
+            rate_hz=rate_hz,
+            limit_s=minutes * 60.0 + 300.0,
+            render_threads=2,
+            progress=report,
+        )
+
+
+def _live(quiet: bool, run: Callable[[Callable[[Progress], None]], Any]) -> Any:
+    from morpheyes_daemon.cli.flight_line import FlightLine
+
+    with FlightLine(quiet) as line:
+        return run(line.show)
+
+
+def _times(times: Times) -> str:
+    p95, most = f"p95 {times.p95_ms:.1f} ms", f"largest {times.max_ms:.1f} ms"
+    return f"{times.median_ms:.1f} ms median, {p95}, {most} of {times.repeats}"
+
+
+def _beat(p50_s: float, p99_s: float, max_s: float) -> str:
+    return f"{p50_s * 1e3:.1f} ms median, p99 {p99_s * 1e3:.1f} ms, largest {max_s * 1e3:.1f} ms"
+
+
+def _say(document: dict[str, Any], rows: list[tuple[str, str]], as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps(document, indent=2))
+        return
+    for name, value in rows:
+        typer.echo(f"{name:>18}  {value}")

@@ -1,0 +1,53 @@
+"""A running ArduPilot SITL in place of the autopilot twin: its ports, its parameters, and the crew around it.
+
+The daemon has the first port; the crew (mavsdk) and the truth take the next two, which SITL offers for that. What
+SITL is set up for (GPS or optical flow) is read from it, and the settings that `doctor` asks for are set.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+
+from morpheyes_daemon.clock import Clock
+from morpheyes_daemon.devices.link import open_link
+from morpheyes_daemon.errors import ConfigError
+from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED
+from morpheyes_daemon.simulation.mavsdk_crew import SITL_RC_PORT, MavsdkCrew, RadioOverUdp
+from morpheyes_daemon.simulation.radio import Radio
+from morpheyes_daemon.simulation.sitl_vehicle import SitlVehicle
+
+FIRST_PORT, CREW_PORT, TRUTH_PORT = 5760, 2, 3
+"""SITL's serial0 is tcp 5760 (plus 10 per instance); serial1 and serial2 are two and three above."""
+RECOMMENDED_HERE = {name: value for name, value in RECOMMENDED.items() if name != "RNGFND1_TYPE"}
+"""The rangefinder is SITL's own."""
+
+@contextlib.asynccontextmanager
+async def open_sitl(url: str, clock: Clock) -> AsyncIterator[tuple[SitlVehicle, MavsdkCrew]]:
+    """Connect truth, radio and crew to the SITL whose first port is `url`, and set its parameters."""
+    host, port = _address(url)
+    radio = Radio()
+    buffer: list[SitlVehicle] = []
+    link = await open_link(f"tcp:{host}:{port + TRUTH_PORT}", lambda data: buffer[0].on_bytes(data), lambda why: None)
+    vehicle = SitlVehicle(link, radio, clock)
+    buffer.append(vehicle)
+    waves = RadioOverUdp(radio, clock, host, SITL_RC_PORT + port - FIRST_PORT)
+    sending = asyncio.create_task(waves.run())
+    try:
+        async with MavsdkCrew(radio, f"tcp:{host}:{port + CREW_PORT}", clock) as crew:
+            await vehicle.listen()
+            await crew.set_parameters(RECOMMENDED_HERE)
+            yield vehicle, crew
+    finally:
+        sending.cancel()
+        await asyncio.gather(sending, return_exceptions=True)
+        link.close()
+
+
+def _address(url: str) -> tuple[str, int]:
+    scheme, _, rest = url.partition(":")
+    host, _, port = rest.rpartition(":")
+    if scheme != "tcp" or not host or not port.isdigit():
+        raise ConfigError(f"--autopilot {url}: write tcp:HOST:PORT, the first port of the SITL, mostly 5760.")
+    return host, int(port)

@@ -1,0 +1,119 @@
+"""Flights at the clock's pace: on the twin, and on a real ArduPilot SITL where there is one.
+
+`MORPHEYES_SITL=tcp:127.0.0.1:5760 pytest tests/e2e/test_realtime_flight.py`; the SITL stands on the ground, disarmed,
+with GPS or with optical flow. Nothing here asserts how fast this machine is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from morpheyes_daemon.clock import S, Ticker, running_clock
+from morpheyes_daemon.experiments.flight import FlightPlan
+from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.experiments.realtime import RealtimeFlight, fly_realtime, realtime_daemon
+from morpheyes_daemon.experiments.simulator_process import PilotAct
+from morpheyes_daemon.safety.gate import GateOutput
+from morpheyes_daemon.safety.states import Action, State
+
+pytest.importorskip("numba")
+SITL = os.environ.get("MORPHEYES_SITL", "")
+on_sitl = pytest.mark.skipif(not SITL, reason="no ArduPilot SITL: set MORPHEYES_SITL to its address")
+twin, sitl = pytest.param(None, id="twin"), pytest.param(SITL, id="sitl", marks=on_sitl)
+both = pytest.mark.parametrize("autopilot", [twin, sitl])
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+CRUISE_M_S = 1.0
+FLY_LIMIT_S = 120.0
+AFTER_S = 8.0
+ESTIMATE_M = 0.5
+"""How far the autopilot's own position may be off over such a stop, and the wind may push."""
+
+
+@pytest.fixture
+def plan() -> FlightPlan:
+    return make_plan("forest", size="320x240", calibration="exact", limit_s=240.0)
+
+
+@asynccontextmanager
+async def cruising(plan: FlightPlan, folder: Path, autopilot: str | None) -> AsyncIterator[RealtimeFlight]:
+    """A flight that goes through the forest at more than a walk."""
+    async with realtime_daemon(plan, folder / "flight.mcap", autopilot, lambda progress: None) as flight:
+        await until(flight, lambda: flight.daemon.guardian.state is State.ENGAGED and speed(flight) > CRUISE_M_S)
+        yield flight
+
+
+def speed(flight: RealtimeFlight) -> float:
+    vehicle = flight.daemon.topics.vehicle.get()
+    return math.hypot(*vehicle.v_ned_m_s[:2]) if vehicle is not None else 0.0
+
+
+async def until(flight: RealtimeFlight, done: Callable[[], bool], limit_s: float = FLY_LIMIT_S) -> None:
+    clock = running_clock()
+    ticker, end_ns = Ticker(clock, 50.0), clock.now_ns() + round(limit_s * S)
+    while not done():
+        assert clock.now_ns() < end_ns, f"{flight.daemon.guardian.state}: {flight.daemon.guardian.reason.text}"
+        assert not flight.running.done()
+        await ticker.wait()
+
+
+@both
+def test_the_forest_mission_is_reached(plan: FlightPlan, tmp_path: Path, autopilot: str | None) -> None:
+    summary = fly_realtime(plan, tmp_path, autopilot, lambda progress: None)
+    assert summary.outcome == "reached", summary.reason
+    assert summary.min_clearance_m > 0.0
+    for name in ("summary.json", "flight.mcap", "map.png", "strips.png", "flight.mp4"):
+        assert (tmp_path / name).stat().st_size > 0
+    written = json.loads((tmp_path / "summary.json").read_text())
+    assert len(written["sticks_sha256"]) == 64
+    assert written["max_stick_interval_s"] >= written["p99_stick_interval_s"] > 0.0
+
+
+@both
+@pytest.mark.parametrize("act", list(PilotAct))
+async def test_the_pilot_takes_over(
+    plan: FlightPlan, tmp_path: Path, autopilot: str | None, act: PilotAct
+) -> None:
+    async with cruising(plan, tmp_path, autopilot) as flight:
+        outputs: list[GateOutput] = []
+        flight.daemon.topics.gate.tap(outputs.append)
+        flight.simulator.ask_pilot(act)
+        wanted = State.RELEASED if act is PilotAct.SWITCH_OFF else State.PILOT
+        await until(flight, lambda: flight.daemon.guardian.state is wanted, 10.0)
+        held = [out.action in (Action.STICKS, Action.NEUTRAL) for out in outputs]
+        await asyncio.sleep(1.0)
+        later = [out.action for out in outputs[len(held) :]]
+        assert set(later) <= {Action.RELEASE, Action.SILENT}
+        assert Action.RELEASE in [out.action for out in outputs]
+
+
+@both
+async def test_a_daemon_cut_off_leaves_a_vehicle_that_stops_within_the_reserve(
+    plan: FlightPlan, tmp_path: Path, autopilot: str | None
+) -> None:
+    async with cruising(plan, tmp_path, autopilot) as flight:
+        daemon = flight.daemon
+        before, model = daemon.topics.vehicle.get(), daemon.stopping
+        assert before is not None
+        assert model is not None
+        v = speed(flight)
+        reserve_m = v * daemon.config.safety.dead_daemon_s + model.stopping_distance_m(v, -before.p_ned_m[2])
+        daemon.hub.transmitter.link = None  # nothing of ours goes out any more; what comes in still does
+        farthest_m = 0.0
+        clock = running_clock()
+        end_ns = clock.now_ns() + round(AFTER_S * S)
+        while clock.now_ns() < end_ns:
+            await asyncio.sleep(0.02)
+            now = daemon.topics.vehicle.get()
+            assert now is not None
+            farthest_m = max(farthest_m, math.dist(now.p_ned_m[:2], before.p_ned_m[:2]))
+        assert speed(flight) < 0.3
+        assert farthest_m <= reserve_m + ESTIMATE_M
