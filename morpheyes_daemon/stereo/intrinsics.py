@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.transforms import Array
@@ -135,7 +136,7 @@ def undistort(xy_d: Array, k: tuple[float, float, float, float, float]) -> Array
         if np.all(np.abs(step) <= _NEWTON_TOLERANCE):
             break
     solved = np.abs(distort(xy, k) - target).max(axis=-1, keepdims=True) < 1e-9
-    return np.where(solved & (_determinant(xy, k)[..., None] > 0), xy, np.nan)
+    return np.where(solved & _grows(xy, k)[..., None], xy, np.nan)
 
 
 def _newton_step(xy: Array, target: Array, k: tuple[float, float, float, float, float]) -> Array:
@@ -162,6 +163,7 @@ def _jacobian(xy: Array, k: tuple[float, float, float, float, float]) -> tuple[A
     return xx, xy_, yy
 
 
-def _determinant(xy: Array, k: tuple[float, float, float, float, float]) -> Array:
+def _grows(xy: Array, k: tuple[float, float, float, float, float]) -> NDArray[np.bool_]:
+    """Return where distortion has not folded back: its Jacobian is positive definite."""
     xx, xy_, yy = _jacobian(xy, k)
-    return np.asarray(xx * yy - xy_ * xy_)
+    return np.asarray((xx * yy - xy_ * xy_ > 0) & (xx > 0))

@@ -1,0 +1,153 @@
+"""Images that must not be flown on: frozen, dark, burnt out, blank, eyes swapped, rows that do not align.
+
+Every check is on the safe side of doubt for its kind: a healthy camera in front of a bare wall or at dusk must not
+trip it, since a fault takes the sticks to neutral. What follows from a fault is decided elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import cv2
+import numpy as np
+
+from morpheyes_daemon.messages import Image
+from morpheyes_daemon.stereo.epipolar import RowFit, RowOffsets
+from morpheyes_daemon.stereo.matching import MatchSettings, semi_global
+
+
+class ImageFault(StrEnum):
+    """What is wrong with a stereo frame; `text` is for a person."""
+
+    text: str
+
+    def __new__(cls, code: str, text: str) -> ImageFault:
+        member = str.__new__(cls, code)
+        member._value_ = code
+        member.text = text
+        return member
+
+    FROZEN = "frozen", "an eye sends the same image again"
+    DARK = "dark", "an eye sees next to nothing: lens cap, night, or a dead sensor"
+    BURNT = "burnt", "an eye is burnt out: exposure, or the sun"
+    BLANK = "blank", "an eye shows one even grey"
+    SWAPPED = "swapped", "the left and the right eye are swapped"
+    MISALIGNED = "misaligned", "the rows of the eyes do not align: bent rig or wrong calibration"
+    DESYNCHRONIZED = "desynchronized", "the eyes do not expose at the same time"
+
+
+MAX_SHIFT_ROWS = 12
+"""Largest row shift that is recognized in the coarse pair: 48 rows at 640x480."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageLimits:
+    """Where a fault begins. Grey levels are of 255; fractions of the image; rows in pixels of the rectified image."""
+
+    dark_below: int = 12
+    burnt_above: int = 250
+    burnt_fraction: float = 0.5
+    blank_spread: float = 1.5
+    suspicious_valid_fraction: float = 0.45
+    better_gain: float = 2.0
+    better_share: float = 0.35
+    misaligned_px: float = 1.5
+    misaligned_points: int = 60
+    late_sigmas: float = 5.0
+
+
+class FrozenCheck:
+    """Tells an image that is sent again: a sensor's noise never repeats itself."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Image, Image] | None = None
+
+    def check(self, left: Image, right: Image) -> bool:
+        """Return True when either raw image equals the one before it."""
+        last, self._last = self._last, (left, right)
+        return last is not None and (_same(last[0], left) or _same(last[1], right))
+
+
+def exposure_faults(left: Image, right: Image, limits: ImageLimits | None = None) -> set[ImageFault]:
+    """Return what is wrong with how bright a grey pair (H, W) is; every eighth pixel is looked at."""
+    limits = limits or ImageLimits()
+    faults = set()
+    for eye in (left[::8, ::8], right[::8, ::8]):
+        if np.percentile(eye, 99.0) < limits.dark_below:
+            faults.add(ImageFault.DARK)
+        elif np.mean(eye >= limits.burnt_above) > limits.burnt_fraction:
+            faults.add(ImageFault.BURNT)
+        elif float(eye.std()) < limits.blank_spread:
+            faults.add(ImageFault.BLANK)
+    return faults
+
+
+def matching_faults(
+    left: Image, right: Image, valid_fraction: float, limits: ImageLimits | None = None
+) -> set[ImageFault]:
+    """Return why a rectified grey pair (H, W) has so little depth, if it matches far better in another way.
+
+    Swapped eyes have negative disparities only; rows that are off by many pixels match once they are shifted. A pair
+    with enough depth (`valid_fraction`) is not looked at; the others are, coarsely, the other way round and shifted.
+    """
+    limits = limits or ImageLimits()
+    if valid_fraction >= limits.suspicious_valid_fraction:
+        return set()
+    small_left, small_right = _small(left), _small(right)
+    enough = max(limits.better_share, limits.better_gain * _matched_share(small_left, small_right))
+    if _matched_share(small_right, small_left) >= enough:
+        return {ImageFault.SWAPPED}
+    rows = row_shift(small_left, small_right)
+    if rows and _matched_share(small_left, np.roll(small_right, -rows, axis=0)) >= enough:
+        return {ImageFault.MISALIGNED}
+    return set()
+
+
+def row_shift(left: Image, right: Image) -> int:
+    """Return by how many rows the right image (H, W) lies lower than the left, from their mean vertical gradients.
+
+    Parallax moves things within their rows, so the rows' means keep their pattern.
+    """
+    profiles = [cv2.Sobel(eye, cv2.CV_32F, 0, 1).mean(axis=1, dtype=np.float64) for eye in (left, right)]
+    edge = MAX_SHIFT_ROWS
+    inner = profiles[0][edge:-edge]
+    scores = [
+        float(np.corrcoef(inner, profiles[1][edge + shift : len(inner) + edge + shift])[0, 1])
+        for shift in range(-edge, edge + 1)
+    ]
+    return int(np.argmax(np.nan_to_num(scores, nan=-1.0))) - edge
+
+
+def _small(image: Image) -> Image:
+    scale = MatchSettings().coarse_width_px / image.shape[1]
+    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _matched_share(left: Image, right: Image) -> float:
+    """Return the share of a small pair that matches with a disparity of at least one pixel."""
+    settings = MatchSettings()
+    disparity = semi_global(left, right, 0, 48, settings, settings.coarse_speckle_px)
+    return float(np.mean(disparity >= 1.0))
+
+
+def row_faults(
+    offsets: RowOffsets, fit: RowFit, declared_late_s: float, limits: ImageLimits | None = None
+) -> set[ImageFault]:
+    """Return what the row offsets of a frame and their explanation (`epipolar.RowWatch`) say against the pair.
+
+    `declared_late_s` bounds the time between the eyes that is known and accounted for.
+    """
+    limits = limits or ImageLimits()
+    faults = set()
+    if abs(fit.late_s) - limits.late_sigmas * fit.late_sigma_s > declared_late_s:
+        faults.add(ImageFault.DESYNCHRONIZED)
+    elif offsets.count >= limits.misaligned_points and offsets.median_px > limits.misaligned_px:
+        faults.add(ImageFault.MISALIGNED)
+    return faults
+
+
+def _same(before: Image, after: Image) -> bool:
+    if before.shape != after.shape or not np.array_equal(before[::16], after[::16]):
+        return False
+    return np.array_equal(before, after)
