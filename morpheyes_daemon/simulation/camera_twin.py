@@ -66,7 +66,7 @@ class _Lens:
 
     def depth(self, rendered: Rendered) -> FloatMap:
         """Return depth along z at the distorted pixels (nearest sample)."""
-        return np.asarray(cv2.remap(rendered.depth_m, self.map, None, cv2.INTER_NEAREST), dtype=np.float32)
+        return np.asarray(cv2.remap(rendered.depth_m, self.map, np.empty(0), cv2.INTER_NEAREST), dtype=np.float32)
 
 
 class CameraTwin:
@@ -119,8 +119,9 @@ class CameraTwin:
         if self._pool is None:
             left = self._view(0, t_ns, pose_at, baseline_true_m)
             return left, self._view(1, right_ns, pose_at, baseline_true_m)
-        jobs = [self._pool.submit(self._view, eye, t, pose_at, baseline_true_m) for eye, t in enumerate((t_ns, right_ns))]
-        return jobs[0].result(), jobs[1].result()
+        left_job = self._pool.submit(self._view, 0, t_ns, pose_at, baseline_true_m)
+        right_job = self._pool.submit(self._view, 1, right_ns, pose_at, baseline_true_m)
+        return left_job.result(), right_job.result()
 
     def _view(self, eye: int, t_ns: int, pose_at: PoseAt, baseline_true_m: float) -> Rendered:
         n = self.sensor.sub_exposures
@@ -128,7 +129,7 @@ class CameraTwin:
         views = [self._instant(eye, t_ns + round(offset * 1e9), pose_at, baseline_true_m) for offset in offsets]
         if n == 1:
             return views[0]
-        mean = np.mean([view.radiance for view in views], axis=0, dtype=np.float32)
+        mean = sum((view.radiance for view in views[1:]), views[0].radiance) / np.float32(n)
         return replace(views[n // 2], radiance=mean)
 
     def _instant(self, eye: int, t_ns: int, pose_at: PoseAt, baseline_true_m: float) -> Rendered:

@@ -52,7 +52,8 @@ def frustum_solid(base: Array, top: Array, radius_base_m: float, radius_top_m: f
     """Return a tapered cylinder between two points (3,)."""
     axis = top - base
     height = float(np.linalg.norm(axis))
-    return Solid(FRUSTUM, pose(_frame_along(axis / height), 0.5 * (base + top)), (radius_base_m, radius_top_m, height / 2))
+    T = pose(_frame_along(axis / height), 0.5 * (base + top))
+    return Solid(FRUSTUM, T, (radius_base_m, radius_top_m, height / 2))
 
 
 def ellipsoid_solid(centre: Array, radii: Array) -> Solid:
@@ -88,12 +89,11 @@ class Obstacles:
         size = np.zeros(7)
         size[: len(body.size)] = body.size
         reach = float(np.linalg.norm(body._extent()))
-        return float(
-            nearest(
-                self._kinds, self._frames, self._sizes, body.kind, np.ascontiguousarray(body.T[:3]), size, reach,
-                self._capsules, limit_m, _DIRECTIONS,
-            )  # fmt: skip
-        )
+        found = nearest(
+            self._kinds, self._frames, self._sizes, body.kind, np.ascontiguousarray(body.T[:3]), size, reach,
+            self._capsules, limit_m, _DIRECTIONS,
+        )  # fmt: skip
+        return float(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

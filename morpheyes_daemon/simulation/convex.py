@@ -67,7 +67,9 @@ def _support(kind: int, frame: Any, size: Any, d: Any, sign: float, out: Any) ->
 
 
 @allocating
-def _difference(kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: Any, size_b: Any, d: Any, out: Any) -> None:
+def _difference(
+    kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: Any, size_b: Any, d: Any, out: Any
+) -> None:
     """Write the support point of A - B along d."""
     out[:] = 0.0
     _support(kind_a, frame_a, size_a, d, 1.0, out)
@@ -75,7 +77,7 @@ def _difference(kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: An
 
 
 @allocating
-def _dot(a: Any, b: Any) -> float:
+def _dot(a: Any, b: Any) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

@@ -43,7 +43,7 @@ def _cubic(t: Any) -> tuple[Any, Any, Any, Any]:
 
 @kernel
 def develop(
-    radiance: Any, lens_map: Any, vignette: Any, gain: float, shot: float, read: float, noise: Any, key: Any, image: Any
+    radiance: Any, lens_map: Any, vignette: Any, gain: Any, shot: Any, read: Any, noise: Any, key: Any, image: Any
 ) -> None:
     """Fill image (h, w, 3) uint8 from radiance (H, W, 3) at lens_map (h, w, 2) = x, y.
 
@@ -59,20 +59,22 @@ def develop(
         at = _hashed(key, row)
         for column in range(width):
             x, y = lens_map[row, column, 0], lens_map[row, column, 1]
-            x0 = min(max(int(math.floor(x)), 1), last_column)
-            y0 = min(max(int(math.floor(y)), 1), last_row)
+            x0 = min(max(int(x), 1), last_column)
+            y0 = min(max(int(y), 1), last_row)
             wx = _cubic(x - np.float32(x0))
             wy = _cubic(y - np.float32(y0))
-            b, g, r = zero, zero, zero
-            for j in range(4):
-                line = radiance[y0 - 1 + j]
-                b += wy[j] * (wx[0] * line[x0 - 1, 0] + wx[1] * line[x0, 0] + wx[2] * line[x0 + 1, 0] + wx[3] * line[x0 + 2, 0])
-                g += wy[j] * (wx[0] * line[x0 - 1, 1] + wx[1] * line[x0, 1] + wx[2] * line[x0 + 1, 1] + wx[3] * line[x0 + 2, 1])
-                r += wy[j] * (wx[0] * line[x0 - 1, 2] + wx[1] * line[x0, 2] + wx[2] * line[x0 + 1, 2] + wx[3] * line[x0 + 2, 2])
             light = gain * vignette[row, column]
-            place = at + 3 * column
-            signal = (min(max(light * b, zero), one), min(max(light * g, zero), one), min(max(light * r, zero), one))
             for c in range(3):
-                value = signal[c] + math.sqrt(shot * signal[c] + read) * noise[(place + c) & mask]
+                total = zero
+                for j in range(4):
+                    v = np.uint64(y0 - 1 + j)
+                    total += wy[j] * (
+                        wx[0] * radiance[v, np.uint64(x0 - 1), c]
+                        + wx[1] * radiance[v, np.uint64(x0), c]
+                        + wx[2] * radiance[v, np.uint64(x0 + 1), c]
+                        + wx[3] * radiance[v, np.uint64(x0 + 2), c]
+                    )
+                signal = min(max(light * total, zero), one)
+                value = signal + math.sqrt(shot * signal + read) * noise[(at + 3 * column + c) & mask]
                 value = min(max(value, zero), one)
                 image[row, column, c] = np.uint8(np.float32(255.0) * math.sqrt(value) + np.float32(0.5))

@@ -25,7 +25,10 @@ LIGHT_MAP_PX = 2048
 FAR_GROUND_M = 600.0
 
 RANGES = ((0.0, 16.0), (16.0, 40.0), (40.0, 110.0))
-"""Distances in metres at which the levels of detail are drawn."""
+"""Distances in metres at which the levels of detail of foliage are drawn."""
+
+TRUNK_SIDES = ((20, (0.0, 5.0)), (12, (5.0, 14.0)), (8, (14.0, 32.0)), (6, (32.0, 110.0)))
+"""Sides of the prism that stands for a trunk, within half a pixel of it at f = 740 px, by distance in metres."""
 
 
 class ForestWorld(Section):
@@ -73,8 +76,8 @@ class Tree:
     def placed(self, unit: Array) -> Array:
         """Return unit-space points (n, 3) of the species in ned: turned, widened, carried along the trunk."""
         c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
-        M = np.stack([self.width_m * np.array([c, s, 0.0]), self.width_m * np.array([-s, c, 0.0]), self.top - self.base])
-        return np.asarray(self.base + unit @ M)
+        across = self.width_m * np.array([[c, s, 0.0], [-s, c, 0.0]])
+        return np.asarray(self.base + unit @ np.vstack([across, self.top - self.base]))
 
     def crowns(self) -> list[tuple[Array, Array]]:
         """Return the ellipsoids of foliage: centre (ned) and radii (across, across, up)."""
@@ -175,7 +178,7 @@ def tree_meshes(tree: Tree, object_id: int, light: Light) -> list[Mesh]:
     """Return trunk and foliage of one tree, coarser for greater distances."""
     sun, parts = light.direction, []
     bark: Bgr = (tree.tone, tree.tone, tree.tone)
-    for sides, span in zip((20, 10, 6), RANGES, strict=True):
+    for sides, span in TRUNK_SIDES:
         vertices, uv, normals, triangles = meshes.frustum(
             tree.base, tree.top, tree.radius_m, tree.top_radius_m, sides
         )
@@ -209,7 +212,7 @@ def light_map(world: ForestWorld, trees: list[Tree], light: Light, seed: int) ->
     slide = sun[:2] / sun[2]  # how far north and east a shadow falls per metre of height, since z points down
 
     def pixel(p: Array) -> Array:
-        return (p[:2] - p[2] * slide - origin) * scale
+        return np.asarray((p[:2] - p[2] * slide - origin) * scale)
 
     trunks = np.zeros((n, n), np.uint8)
     foliage = np.zeros((n, n), np.uint8)

@@ -41,5 +41,6 @@ def _cached(function: F, **options: bool) -> F:
 
 
 def _compiled(function: F, **options: bool) -> F:
-    compiled: Any = numba.njit(nogil=True, **options)(function)
-    return compiled  # type: ignore[no-any-return]
+    jit: Any = numba.njit  # its types know nothing of `_nrt`
+    compiled: F = jit(nogil=True, **options)(function)
+    return compiled

@@ -46,7 +46,7 @@ def _circle(sides: int) -> Array:
 
 @cache
 def icosphere(subdivisions: int) -> tuple[Array, Triangles]:
-    """Return unit vertices (V, 3) and triangles of a subdivided icosahedron; read-only, a forest asks thousandfold."""
+    """Return unit vertices (V, 3) and triangles of a subdivided icosahedron; read-only: many ask."""
     phi = (1.0 + math.sqrt(5.0)) / 2.0
     corners = [(s * 1.0, t * phi, 0.0) for s in (-1, 1) for t in (-1, 1)]
     points = [np.roll(c, k) for k in range(3) for c in corners]
@@ -139,11 +139,13 @@ def sky_dome(rings: int = 12, segments: int = 24, radius_m: float = 1e5) -> Surf
     """Return a sphere seen from inside; u is azimuth / 2 pi, v is (90 deg - elevation) / 180 deg."""
     v, u = np.meshgrid(np.linspace(0, 1, rings + 1), np.linspace(0, 1, segments + 1), indexing="ij")
     elevation, azimuth = (0.5 - v) * math.pi, u * 2 * math.pi
-    unit = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), -np.sin(elevation)], -1)
+    level = np.cos(elevation)
+    unit = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), -np.sin(elevation)], axis=-1)
     unit[:, -1] = unit[:, 0]
     i = np.arange(rings * (segments + 1)).reshape(rings, segments + 1)[:, :-1].ravel()
     right, down = i + 1, i + segments + 1
-    triangles = np.concatenate([np.column_stack([i, right, down]), np.column_stack([right, right + segments + 1, down])])
+    upper, lower = np.column_stack([i, right, down]), np.column_stack([right, down + 1, down])
+    triangles = np.concatenate([upper, lower])
     unit = unit.reshape(-1, 3)
     return radius_m * unit, np.column_stack([u.ravel(), v.ravel()]), -unit, triangles.astype(np.int32)
 

@@ -28,7 +28,7 @@ SAMPLES: NDArray[np.float64] = np.array(
 TILE = 8
 """Edge in pixels of the tiles for which the farthest sample is known."""
 
-REFRESH_TRIANGLES = 600
+REFRESH_TRIANGLES = 300
 """Triangles drawn until the tiles are looked at again."""
 
 PLANES = 12
@@ -150,19 +150,29 @@ def _scan(
 
 
 @inlined
-def _refresh(buffer: Any, farthest: Any) -> None:
-    """Note for every tile the smallest 1/z of its samples (0 where one is empty): what lies behind is hidden."""
+def _farthest_in(buffer: Any, top: int, left: int) -> Any:
+    """Return the smallest 1/z in a tile, 0 if one of its samples is empty."""
     planes, height, width = buffer.shape
+    smallest = buffer[0, top, left]
+    for s in range(planes):
+        for row in range(top, min(top + TILE, height)):
+            for column in range(left, min(left + TILE, width)):
+                smallest = min(smallest, buffer[s, np.uint64(row), np.uint64(column)])
+            if smallest == np.uint64(0):
+                return np.float32(0.0)
+    return np.uint32(smallest >> np.uint64(32)).view(np.float32)
+
+
+@inlined
+def _refresh(buffer: Any, farthest: Any) -> None:
+    """Look which tiles have filled up: what lies behind their farthest sample is hidden.
+
+    Later drawing could only bring that sample nearer, and drawing nearest first, hardly ever does.
+    """
     for i in range(farthest.shape[0]):
         for j in range(farthest.shape[1]):
-            smallest = np.uint64(0xFFFFFFFFFFFFFFFF)
-            for s in range(planes):
-                for row in range(i * TILE, min((i + 1) * TILE, height)):
-                    for column in range(j * TILE, min((j + 1) * TILE, width)):
-                        smallest = min(smallest, buffer[s, row, column])
-                if smallest == np.uint64(0):
-                    break
-            farthest[i, j] = np.uint32(smallest >> np.uint64(32)).view(np.float32)
+            if farthest[i, j] == np.float32(0.0):
+                farthest[i, j] = _farthest_in(buffer, i * TILE, j * TILE)
 
 
 @inlined
@@ -190,7 +200,8 @@ def _is_hidden(polygon: Any, n: int, inverse_z: float, farthest: Any) -> bool:
 def visible_parts(bounds: Any, R: Any, t: Any, eye: Any, intrinsics: Any, size: Any) -> Any:
     """Return the numbers of the parts in view and in drawing range, nearest first.
 
-    bounds (P, 6) = sphere x, y, z, radius and the distances from `eye` (3,) between which a part is drawn; R, t take
+    bounds (P, 6) = sphere x, y, z, radius and the distances along x, y from `eye` (2,) between which a part
+    is drawn; R, t take
     the parts' frame to the camera's; size = (width, height) in pixels.
     """
     f, cx, cy = intrinsics
@@ -199,14 +210,14 @@ def visible_parts(bounds: Any, R: Any, t: Any, eye: Any, intrinsics: Any, size: 
     n = 0
     for part in range(len(bounds)):
         x, y, z, radius = bounds[part, 0], bounds[part, 1], bounds[part, 2], bounds[part, 3]
-        distance = math.sqrt((x - eye[0]) ** 2 + (y - eye[1]) ** 2 + (z - eye[2]) ** 2)
-        if distance < bounds[part, 4] or distance >= bounds[part, 5]:
+        beside = math.sqrt((x - eye[0]) ** 2 + (y - eye[1]) ** 2)
+        if beside < bounds[part, 4] or beside >= bounds[part, 5]:
             continue
         px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]
         py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]
         pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2]
         if _sphere_is_seen(px, py, pz, radius, f, cx, cy, size[0], size[1]):
-            found[n], distances[n] = part, distance - radius
+            found[n], distances[n] = part, pz - radius
             n += 1
     return found[:n][np.argsort(distances[:n], kind="mergesort")]
 
@@ -247,9 +258,9 @@ def rasterise(
 ) -> int:
     """Draw the parts of one batch in the given order; return how many set-up records are in use now.
 
-    vertices (V, 3), attributes (V, 3) = (u, v in tiles, sun), triangles (T, 3) in the batch's frame; per part: ranges (P, 4) =
-    first vertex, end, first triangle, end; flags (P, 2) = two-sided, loose. q (most vertices of
-    a part, 3) and polygon (4, 2) are scratch.
+    vertices (V, 3), attributes (V, 3) = (u, v in tiles, sun), triangles (T, 3) in the batch's frame; per part:
+    ranges (P, 4) = first vertex, end, first triangle, end; flags (P, 2) = two-sided, loose. q (most vertices of a
+    part, 3) and polygon (4, 2) are scratch.
     """
     drawn = 0
     for n in range(len(order)):

@@ -61,7 +61,8 @@ def _batch(meshes: Sequence[Mesh], materials: Mapping[str, Material], first_part
     ends = np.cumsum(sizes, axis=0)
     starts = ends - sizes
     vertices = np.concatenate([m.vertices_m for m in meshes]).astype(np.float64)
-    attributes = np.concatenate([np.column_stack([m.uv_m * materials[m.material].tiles_per_m, m.sun]) for m in meshes]).astype(np.float64)
+    tiles = [m.uv_m * materials[m.material].tiles_per_m for m in meshes]
+    attributes = np.column_stack([np.concatenate(tiles), np.concatenate([m.sun for m in meshes])])
     triangles = np.concatenate([m.triangles + s for m, s in zip(meshes, starts[:, 0], strict=True)])
     bounds = np.array([(*_sphere(m.vertices_m), *m.draw_range_m) for m in meshes], np.float64)
     ranges = np.column_stack([starts[:, 0], ends[:, 0], starts[:, 1], ends[:, 1]])
@@ -111,8 +112,9 @@ class Renderer:
         sky = (scene.sky,) if scene.sky is not None else ()
         groups = [*(body.meshes for body in scene.moving), tuple(scene.meshes), sky]
         meshes = [mesh for group in groups for mesh in group]
-        starts = np.cumsum([0, *(len(group) for group in groups)])
-        self._batches = [_batch(g, scene.materials, int(s)) if g else None for g, s in zip(groups, starts, strict=False)]
+        starts = np.cumsum([0, *(len(group) for group in groups)])[:-1].tolist()
+        pairs = zip(groups, starts, strict=True)
+        self._batches = [_batch(group, scene.materials, start) if group else None for group, start in pairs]
         self._looks = np.array([(*m.tint, m.ambient) for m in meshes], np.float32)
         self._part_materials = np.array([names[m.material] for m in meshes], np.int64)
         self._part_objects = np.array([m.object_id for m in meshes], np.int32)
@@ -168,9 +170,9 @@ class Renderer:
             np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.full(shape, SKY_OBJECT, np.int32)
         )
         shade_image(
-            buffer, SAMPLES, work.sample_groups, work.records, work.parts, work.groups, self._looks, self._part_materials,
-            self._part_objects, self._materials, self._ratios, self._atlas.texels, self._atlas.levels,
-            self._light, rendered.radiance, rendered.depth_m, rendered.objects,
+            buffer, SAMPLES, work.sample_groups, work.records, work.parts, work.groups, self._looks,
+            self._part_materials, self._part_objects, self._materials, self._ratios,
+            self._atlas.texels, self._atlas.levels, self._light, rendered.radiance, rendered.depth_m, rendered.objects,
         )  # fmt: skip
         return rendered
 

@@ -84,7 +84,7 @@ class RigTwin:
         """Return the true distance between the eyes when the servos stand at `nominal_m` on their own scale."""
         s = self._along(nominal_m)
         wave = self._servo[0] * math.sin(1.1 * math.pi * s) + self._servo[1] * math.cos(0.9 * math.pi * s)
-        return nominal_m + 0.5e-3 * self.errors.nonlinearity_mm * wave
+        return float(nominal_m + 0.5e-3 * self.errors.nonlinearity_mm * wave)
 
     @staticmethod
     def _along(baseline_m: float) -> float:
@@ -94,14 +94,12 @@ class RigTwin:
     def T_rig_eye(self, eye: int, baseline_m: float) -> Array:
         """Return the true pose (4, 4) of the left (0) or right (1) eye on the bar at a true baseline."""
         s = self._along(baseline_m)
-        basis = np.stack([np.ones(3), np.full(3, s), np.sin(2.2 * s + self._phase[eye])])
-        rotation = (self._rotation[eye].T * basis).sum(axis=0)
-        offset = (self._offset[eye].T * basis).sum(axis=0)
-        other = (self._offset[1 - eye].T * np.stack([np.ones(3), np.full(3, s), np.sin(2.2 * s + self._phase[1 - eye])]))
-        across = offset[1:] - other.sum(axis=0)[1:]
+        basis = np.stack([np.ones((2, 3)), np.full((2, 3), s), np.sin(2.2 * s + self._phase)], axis=-1)
+        rotation, offset = (self._rotation * basis).sum(axis=-1)[eye], (self._offset * basis).sum(axis=-1)
+        across = offset[1, 1:] - offset[0, 1:]
         # the carriages move so that the distance between the eyes is the baseline in spite of the offsets
         half = 0.5 * math.sqrt(baseline_m**2 - float(across @ across))
-        t = np.array([half if eye else -half, offset[1], offset[2]])
+        t = np.array([half if eye else -half, offset[eye, 1], offset[eye, 2]])
         return pose(R_from_rotvec(rotation), t)
 
     def T_cam0_cam1(self, baseline_m: float) -> Array:

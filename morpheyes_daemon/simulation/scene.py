@@ -25,7 +25,8 @@ GROUND_OBJECT = 0
 class Mesh:
     """One part: vertices_m (V, 3), uv_m (V, 2), sun (V,) share of sunlight, triangles (T, 3) int32.
 
-    The triangles of a `loose` part are smoothed against each other, too. It is drawn where the viewer's distance to its centre is in `draw_range_m`. Parts of one tree share `object_id`.
+    The triangles of a `loose` part are smoothed against each other, too. It is drawn where the viewer's distance to
+    its centre along x and y is in `draw_range_m`. Parts of one tree share `object_id`.
     """
 
     vertices_m: Array

@@ -8,7 +8,6 @@ called whose last bit depends on the machine.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -37,14 +36,6 @@ def _log2(x: float) -> float:
 
 
 @inlined
-def _lanes(texel: Any) -> Any:
-    """Spread the four bytes of a texel into four 16-bit lanes."""
-    wide = np.uint64(texel)
-    wide = (wide | (wide << np.uint64(16))) & np.uint64(0x0000FFFF0000FFFF)
-    return (wide | (wide << np.uint64(8))) & np.uint64(0x00FF00FF00FF00FF)
-
-
-@inlined
 def _bilinear(texels: Any, start: int, log_size: int, u: float, v: float) -> Any:
     """Sample one mip level (wrapping) at (u, v) in tiles; four 16-bit lanes, 255 * 256 for 1."""
     size = 1 << log_size
@@ -54,14 +45,15 @@ def _bilinear(texels: Any, start: int, log_size: int, u: float, v: float) -> Any
     fx, fy = x & 255, y & 255
     x0, y0, x1, y1 = (x >> 8) & mask, (y >> 8) & mask, ((x >> 8) + 1) & mask, ((y >> 8) + 1) & mask
     # texels lie in blocks of 4 x 4, see textures.pack
-    row0, row1 = start + ((y0 >> 2) << (log_size + 2)) + ((y0 & 3) << 2), start + ((y1 >> 2) << (log_size + 2)) + ((y1 & 3) << 2)
+    row0 = start + ((y0 >> 2) << (log_size + 2)) + ((y0 & 3) << 2)
+    row1 = start + ((y1 >> 2) << (log_size + 2)) + ((y1 & 3) << 2)
     column0, column1 = ((x0 >> 2) << 4) + (x0 & 3), ((x1 >> 2) << 4) + (x1 & 3)
     w11 = (fx * fy) >> 8
     return (
-        np.uint64(256 - fx - fy + w11) * _lanes(texels[np.uint64(row0 + column0)])
-        + np.uint64(fx - w11) * _lanes(texels[np.uint64(row0 + column1)])
-        + np.uint64(fy - w11) * _lanes(texels[np.uint64(row1 + column0)])
-        + np.uint64(w11) * _lanes(texels[np.uint64(row1 + column1)])
+        np.uint64(256 - fx - fy + w11) * texels[np.uint64(row0 + column0)]
+        + np.uint64(fx - w11) * texels[np.uint64(row0 + column1)]
+        + np.uint64(fy - w11) * texels[np.uint64(row1 + column0)]
+        + np.uint64(w11) * texels[np.uint64(row1 + column1)]
     )
 
 
@@ -78,7 +70,7 @@ def _unpacked(lanes: Any) -> tuple[Any, Any, Any, Any]:
 
 
 @inlined
-def _footprint(x: float, y: float, records: Any, i: int, size: float) -> tuple[float, int, float, float]:
+def _footprint(x: float, y: float, records: Any, i: Any, size: float) -> tuple[float, int, float, float]:
     """Return how a pixel of record i reads its texture: mip level, number of taps, and their spread in tiles."""
     z = 1.0 / (records[i, 0] * x + records[i, 1] * y + records[i, 2])
     u = (records[i, 3] * x + records[i, 4] * y + records[i, 5]) * z
@@ -122,7 +114,7 @@ def _detail(
 
 @inlined
 def _shade(
-    x: float, y: float, records: Any, i: int, part: int, footprint: tuple[float, int, float, float],
+    x: float, y: float, records: Any, i: Any, part: int, footprint: tuple[float, int, float, float],
     looks: Any, materials: Any, m: int, ratios: Any, texels: Any, levels: Any, light: Any,
 ) -> tuple[Any, Any, Any]:  # fmt: skip
     """Return the linear radiance (blue, green, red) of the surface of record i at pixel (x, y)."""
@@ -168,10 +160,17 @@ def _gather(groups: Any, first: int, samples: Any) -> tuple[int, float, float]:
 
 @inlined
 def _is_uniform(buffer: Any, row: int, column: int, record_groups: Any, groups: Any) -> bool:
-    """Note the group of every sample of a pixel and tell whether they are all the same; -1 is nothing."""
+    """Tell whether all samples of a pixel see the same; if not, note the group of each, -1 for nothing."""
+    x = np.uint64(column)
+    difference = np.uint64(0)
+    for s in range(1, buffer.shape[0]):
+        difference |= buffer[s, row, x] ^ buffer[0, row, x]
+    if difference & RECORD == np.uint64(0):
+        groups[0] = 0
+        return True
     uniform = True
     for s in range(buffer.shape[0]):
-        key = buffer[s, row, column]
+        key = buffer[s, row, x]
         groups[s] = record_groups[key & RECORD] if key else -1
         uniform = uniform and groups[s] == groups[0]
     return uniform
@@ -201,12 +200,13 @@ def shade_image(
 
     looks (P, 4) = tint b, g, r and share of sky light per part; materials (M, 5) = texture, log2 of its size,
     modulating texture (-1: none), log2 of its size, kind (1 emissive, 2 sky); ratios (M, 3) = tiles of the modulating
-    texture per tile in u and v, mip levels between the two; light (4, 3) = sun, sky, haze, 1/haze range; groups (samples,) int64 is scratch.
+    texture per tile in u and v, mip levels between the two; light (4, 3) = sun, sky, haze, 1/haze range; groups
+    (samples,) int64 is scratch.
     """
     planes, height, width = buffer.shape
     share = np.float32(1.0 / planes)
     for row in range(height):
-        known, fresh_until = -1, 0
+        known, fresh_until = np.int64(-1), 0
         footprint = (0.0, 1, 0.0, 0.0)
         for column in range(width):
             uniform = _is_uniform(buffer, row, column, record_groups, groups)

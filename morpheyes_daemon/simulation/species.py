@@ -71,7 +71,8 @@ def broadleaf(number: int) -> Species:
         up = rng.uniform(low + 0.1, 1.0)
         angle, out = 2 * math.pi * (k / 6 + 0.1 * rng.random()), (rng.uniform(0.35, 0.9) if k else 0.0)
         width = rng.uniform(0.6, 0.9)
-        crowns.append((out * math.cos(angle), out * math.sin(angle), up, width, width, min(0.6 * width / ASPECT, up - low)))
+        half = min(0.6 * width / ASPECT, up - low)
+        crowns.append((out * math.cos(angle), out * math.sin(angle), up, width, width, half))
     made = np.array(crowns)
     # meshes are made in ned axes at ASPECT widths of height
     centres = made[:, :3] * (1.0, 1.0, -ASPECT)

@@ -19,7 +19,7 @@ Texels = NDArray[np.uint8]
 Field = NDArray[np.float64]
 
 BLOCK = 4
-"""Texels lie in blocks of 4 x 4: one cache line."""
+"""Texels lie in blocks of 4 x 4."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Texture:
     texels: Texels
 
     @cached_property
-    def levels(self) -> tuple[NDArray[np.uint32], ...]:
+    def levels(self) -> tuple[NDArray[np.uint64], ...]:
         """Mip levels down to one block, colours averaged linearly, each laid out as `_blocks` says."""
         value = self.texels.astype(np.float32)
         value[..., :3] *= value[..., :3]
@@ -46,11 +46,11 @@ class Texture:
 class Atlas:
     """All textures with their mip levels in one array as the kernels want them.
 
-    texels (n,) uint32 hold blue in the lowest byte; levels (textures, levels) say where each mip level starts.
+    texels (n,) uint64 hold blue, green, red and the fourth channel in 16-bit lanes, blue lowest; levels (textures, levels) say where each mip level starts.
     """
 
     names: tuple[str, ...]
-    texels: NDArray[np.uint32]
+    texels: NDArray[np.uint64]
     levels: NDArray[np.int64]
     log_sizes: NDArray[np.int64]
 
@@ -69,11 +69,14 @@ def pack(textures: Mapping[str, Texture]) -> Atlas:
     return Atlas(tuple(textures), flat, levels, log_sizes)
 
 
-def _blocks(level: Texels) -> NDArray[np.uint32]:
-    """Return texels as numbers, block by block, so that neighbours in both directions share a cache line."""
+def _blocks(level: Texels) -> NDArray[np.uint64]:
+    """Return texels as numbers, block by block, so that neighbours in both directions are near in memory.
+
+    The four bytes of a texel are spread into 16-bit lanes, so that one multiplication weighs all channels.
+    """
     n = level.shape[0] // BLOCK
-    packed = np.ascontiguousarray(level).view("<u4").reshape(n, BLOCK, n, BLOCK)
-    return packed.transpose(0, 2, 1, 3).reshape(-1).astype(np.uint32)
+    packed = level.astype("<u2").view("<u8").reshape(n, BLOCK, n, BLOCK)
+    return packed.transpose(0, 2, 1, 3).reshape(-1).astype(np.uint64)
 
 
 def _mip_chain(texture: Texture) -> list[Texels]:
@@ -89,7 +92,9 @@ def _mip_chain(texture: Texture) -> list[Texels]:
     return chain
 
 
-def noise(rng: np.random.Generator, size: int, stretch: tuple[float, float] = (1.0, 1.0), slope: float = 1.0) -> Field:
+def noise(
+    rng: np.random.Generator, size: int, stretch: tuple[float, float] = (1.0, 1.0), slope: float = 1.0
+) -> Field:
     """Return a periodic (size, size) field with mean 0, sigma 1 and amplitude 1/f**slope.
 
     `stretch` (u, v) lengthens its features along an axis, as bark does.
@@ -131,7 +136,7 @@ def bark(seed: int, size: int = 1024) -> Texture:
         [(-1.6, (28, 24, 21)), (-0.3, (74, 66, 58)), (0.6, (128, 119, 107)), (1.6, (196, 187, 172))],
         [(-1.6, (34, 20, 12)), (-0.3, (96, 62, 42)), (0.6, (148, 104, 74)), (1.6, (206, 164, 126))],
     ][seed % 3]
-    bgr = coloured(value, palette)  # type: ignore[arg-type]
+    bgr = coloured(value, palette)
     moss = np.clip(0.8 * noise(rng, size, slope=1.4) - 0.9, 0, 1)[..., None]
     bgr = bgr * (1 - moss) + moss * np.array([52, 118, 92]) * (0.8 + 0.25 * fine[..., None])
     return finished(bgr)
@@ -153,7 +158,9 @@ def leaves(seed: int, size: int = 512) -> Texture:
     return finished(canvas * light[..., None])
 
 
-def _wrapped_ellipse(canvas: Texels, centre: NDArray[np.int64], axes: tuple[int, int], angle: float, bgr: Field) -> None:
+def _wrapped_ellipse(
+    canvas: Texels, centre: NDArray[np.int64], axes: tuple[int, int], angle: float, bgr: Field
+) -> None:
     size = canvas.shape[0]
     reach = max(axes)
     for dx in (-size, 0, size):
@@ -189,7 +196,7 @@ def _wrapped_line(canvas: Texels, start: Field, end: Field, bgr: Field) -> None:
     size = canvas.shape[0]
     for dx in (-size, 0, size):
         for dy in (-size, 0, size):
-            a, b = start + (dx, dy), end + (dx, dy)
+            a, b = start + np.array([dx, dy]), end + np.array([dx, dy])
             if min(a[0], b[0]) < size and max(a[0], b[0]) >= 0 and min(a[1], b[1]) < size and max(a[1], b[1]) >= 0:
                 ends = [tuple(int(c) for c in np.rint(16 * p)) for p in (a, b)]
                 cv2.line(canvas, ends[0], ends[1], bgr.tolist(), 1, cv2.LINE_AA, 4)
@@ -204,6 +211,13 @@ def dapple(seed: int, size: int = 256) -> Texture:
     return finished(tone, sun)
 
 
+SKY_STOPS = [
+    (-5.0, (196, 206, 208)), (2.0, (205, 216, 222)), (12.0, (172, 202, 230)),
+    (40.0, (112, 165, 216)), (90.0, (74, 128, 196)),
+]  # fmt: skip
+"""Colour of the clear sky over elevation in degrees."""
+
+
 @cache
 def sky(seed: int, size: int = 1024) -> Texture:
     """A panorama: u the azimuth, v from the zenith (0) over the horizon (0.5) down; clouds and far woods."""
@@ -211,7 +225,7 @@ def sky(seed: int, size: int = 1024) -> Texture:
     elevation = (0.5 - (np.arange(size) + 0.5) / size)[:, None] * 180.0
     blue = coloured(
         np.broadcast_to(elevation, (size, size)),
-        [(-5, (196, 206, 208)), (2, (205, 216, 222)), (12, (172, 202, 230)), (40, (112, 165, 216)), (90, (74, 128, 196))],
+        SKY_STOPS,
     )
     cloud = np.clip(0.55 * noise(rng, size, (0.6, 2.2), 1.5) + 0.05, 0, 1)[..., None]
     bgr = blue * (1 - 0.8 * cloud) + 0.8 * cloud * np.array([248, 244, 240])
