@@ -11,7 +11,7 @@ from morpheyes_daemon.recorder.pictures.outline import Track, boxes, placed
 from morpheyes_daemon.recorder.pictures.scene import Scene
 from morpheyes_daemon.stereo.colours import baseline_bgr
 
-LEFT_IN, BOTTOM_IN, WIDTH_IN, HEIGHT_IN, APART_IN = 4.9, 0.14, 2.2, 1.66, 0.15
+LEFT_IN, BOTTOM_IN, WIDTH_IN, HEIGHT_IN, APART_IN = 4.3, 0.12, 1.9, 1.48, 0.15
 NORTH_M = 3.2
 EVERY_M = 0.45
 INK = "#30343a"
@@ -32,8 +32,9 @@ def draw_closeups(
         _frame(panel, track, i)
         _draw(panel, track, scene, footprint, i)
         letter = "abcdef"[n]
-        panel.text(0.03, 0.95, f"{letter}   {1e2 * clearance_m:.0f} cm", transform=panel.transAxes, va="top",
-                   fontsize=9, bbox=PLATE, zorder=9)
+        room = f"{1e2 * clearance_m:.0f} cm" if clearance_m > 0 else "touched"
+        panel.text(0.03, 0.95, f"{letter}   {room}", transform=panel.transAxes, va="top", fontsize=9, bbox=PLATE,
+                   zorder=9)
         _letter(axes, track, scene, i, letter)
     if passes:
         text = "closest passes: outline to trunk"
@@ -69,7 +70,7 @@ def _draw(panel: Any, track: Track, scene: Scene, footprint: Footprint, i: int) 
         at, yaw = track.xy_m[j], float(track.yaw_rad[j])
         strength: dict[str, Any] = NEAREST if j == i else AROUND
         panel.add_patch(Polygon(placed(hull, at, yaw), facecolor="white", edgecolor=INK, **strength))
-        panel.add_patch(Polygon(placed(bar, at, yaw), facecolor=(r, g, b), edgecolor=INK, **strength))
+        panel.add_patch(Polygon(placed(bar, at, yaw), facecolor=(r, g, b), edgecolor=INK, **{**strength, "lw": 0.5}))
 
 
 def _spaced(track: Track, i: int) -> list[int]:

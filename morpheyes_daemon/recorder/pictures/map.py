@@ -22,9 +22,9 @@ from morpheyes_daemon.stereo.colours import MAX_BASELINE_M, MIN_BASELINE_M
 Points = NDArray[np.float64]
 Limits = tuple[float, float, float, float]
 
-WIDTH_IN, LEFT_IN, RIGHT_IN, TOP_IN, AXIS_IN = 12.0, 0.62, 0.2, 0.38, 0.5
-LOWER_IN, SCALE_IN, CLOSEUPS = 2.1, 0.75, 3
-DPI = 160
+WIDTH_IN, LEFT_IN, RIGHT_IN, TOP_IN, AXIS_IN = 10.5, 0.62, 0.2, 0.38, 0.5
+LOWER_IN, SCALE_IN, CLOSEUPS = 1.92, 0.75, 3
+DPI = 180
 BESIDE_PATH_M = 5.0
 """How much of the scene is shown on either side of the path."""
 TREE, TREE_EDGE, WALL, WALL_EDGE, GROUND = "#66785f", "#3f4d3a", "#a79a8b", "#6d6257", "#f6f7f2"
@@ -40,7 +40,7 @@ def draw_map(
 
     track = Track.of(series)
     clearance_m = clearances(track, scene, footprint)
-    passes = closest_passes(track, clearance_m, CLOSEUPS, apart_m=4.0)
+    passes = closest_passes(track, clearance_m, CLOSEUPS)
     limits = _limits(track.xy_m, scene)
     inch_per_m = (WIDTH_IN - LEFT_IN - RIGHT_IN) / (limits[1] - limits[0])
     map_in, lower_in = (limits[3] - limits[2]) * inch_per_m, LOWER_IN if passes else SCALE_IN
@@ -126,7 +126,7 @@ def _draw_marks(axes: Any, series: FlightSeries, track: Track, *, collided: bool
         return
     where = track.xy_m[[track.nearest(t) for t, _ in series.braking()]]
     if len(where):
-        style = {"color": "white", "markeredgecolor": RED, "markersize": 7, "markeredgewidth": 1.5}
+        style = {"color": "white", "markeredgecolor": RED, "markersize": 6, "markeredgewidth": 1.3}
         axes.plot(where[:, 0], where[:, 1], "v", zorder=7, label="made to stop", **style)
     if collided:
         style = {"color": RED, "markeredgecolor": "white", "markersize": 12}
@@ -146,7 +146,7 @@ def _draw_legend(figure: Any, axes: Any, lower_in: float) -> None:
     from matplotlib.colors import Normalize
 
     scale = ScalarMappable(Normalize(1e3 * MIN_BASELINE_M, 1e3 * MAX_BASELINE_M), cmap="jet")
-    bar = figure.colorbar(scale, cax=inches(figure, LEFT_IN, lower_in - 0.3, 3.6, 0.13), orientation="horizontal")
+    bar = figure.colorbar(scale, cax=inches(figure, LEFT_IN, lower_in - 0.3, 3.2, 0.13), orientation="horizontal")
     bar.set_label("baseline [mm]", fontsize=9, labelpad=2)
     bar.ax.tick_params(labelsize=8, length=2)
     bar.outline.set_linewidth(0.5)

@@ -81,11 +81,13 @@ def _distance(x: Array, y: Array, half_x: float, half_y: float | Array) -> Array
     return np.hypot(np.maximum(np.abs(x) - half_x, 0.0), np.maximum(np.abs(y) - half_y, 0.0))
 
 
-def closest_passes(track: Track, clearance_m: Array, count: int, apart_m: float) -> list[int]:
-    """Return the indices of at most `count` nearest passes in order of flight, each `apart_m` from the others."""
+def closest_passes(
+    track: Track, clearance_m: Array, count: int, apart_m: float = 4.0, within_m: float = 1.5
+) -> list[int]:
+    """Return the indices of at most `count` passes nearer than `within_m`, in order of flight and `apart_m` apart."""
     chosen: list[int] = []
     for i in np.argsort(clearance_m, kind="stable"):
-        if not np.isfinite(clearance_m[i]):
+        if clearance_m[i] >= within_m:
             break
         if all(np.linalg.norm(track.xy_m[i] - track.xy_m[j]) >= apart_m for j in chosen):
             chosen.append(int(i))
