@@ -1,0 +1,241 @@
+"""Watching the calibration in flight: has an eye turned, and by how much; corrected when the evidence is strong.
+
+Pitch and roll between the eyes show in the rows of every textured frame (stereo.epipolar), the time between the eyes
+in how rows follow the motion, the yaw only where the same static scene is seen at two baselines (`yaw_watch`). Each
+is acted upon only when it is many sigmas clear of zero and confirmed over several frames; scenes without texture,
+frames with the servo moving and scenes that move themselves count for nothing. The rig that was loaded is never
+changed: `rig` is a turned copy, and every correction is told as a finding.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+
+from morpheyes_daemon.calibration.ego_motion import EyeMotion
+from morpheyes_daemon.calibration.yaw_watch import Look, Uncertain, YawWatch
+from morpheyes_daemon.messages import DepthMap, Image
+from morpheyes_daemon.stereo.epipolar import RowFit, RowWatch, row_offsets, row_rates
+from morpheyes_daemon.stereo.rectify import rectifying_rotation
+from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
+from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
+
+_MEMORY = 0.95
+"""How much of the rows' evidence is left one frame later: twenty frames count."""
+
+
+@dataclass(frozen=True, slots=True)
+class DriftLimits:
+    """What counts as drift, and what evidence it takes."""
+
+    rows_px: float = 0.4
+    """Row error that a turn must cause before it is corrected."""
+    yaw_px: float = 0.25
+    """Disparity bias that a yaw must cause before it is corrected."""
+    yaw_sigma_px: float = 0.15
+    """One sigma of the disparity bias from which half of `strong_sigmas` will do."""
+    strong_sigmas: float = 6.0
+    frames: int = 3
+    """Frames in a row that must agree."""
+    points: int = 80
+    """Points that a frame must have to count at all."""
+    largest_rad: float = math.radians(0.6)
+    """A turn beyond this is no drift: something broke, and the calibration must be made again."""
+    late_s: float = 2e-3
+    """Time offset between the eyes that was declared."""
+    late_change_s: float = 1e-3
+    """How far the measured offset may be from it."""
+
+
+class Drift(StrEnum):
+    """What a finding is about."""
+
+    ROWS = "rows"
+    TURNED = "turned"
+    YAW = "yaw"
+    LATE = "late"
+    BROKEN = "broken"
+
+
+@dataclass(frozen=True, slots=True)
+class DriftFinding:
+    """One thing noticed; `corrected` when the rig was turned for it."""
+
+    what: Drift
+    corrected: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class DriftReport:
+    """What one frame added. Angles are of the right eye, from where `rig` has it; sigmas inf when unknown.
+
+    `rows_px` is the median row difference of this frame (NaN without points), `late_s` by how much the right eye
+    exposes after the left one.
+    """
+
+    rows_px: float
+    points: int
+    pitch_rad: float
+    pitch_sigma_rad: float
+    roll_rad: float
+    roll_sigma_rad: float
+    yaw_rad: float
+    yaw_sigma_rad: float
+    late_s: float
+    late_sigma_s: float
+    findings: tuple[DriftFinding, ...]
+
+    @property
+    def rig_changed(self) -> bool:
+        """The monitor's rig was turned: rectify by it from now on."""
+        return any(finding.corrected for finding in self.findings)
+
+
+class DriftMonitor:
+    """Fed with every depth map; `rig` is the calibration as corrected so far, to rectify the next frame by."""
+
+    def __init__(self, rig: RigModel, limits: DriftLimits | None = None, uncertain: Uncertain | None = None) -> None:
+        self.rig = rig
+        self.limits = limits or DriftLimits()
+        self._uncertain = uncertain
+        self._turned: Array = np.eye(3)
+        self._told: set[Drift] = set()
+        self._fit: RowFit | None = None
+        self._agreeing = 0
+        self._rows, self._yaw = RowWatch(memory=_MEMORY), YawWatch(uncertain)
+
+    def update(
+        self, left: Image, right: Image, depth: DepthMap, nominal_m: float, moving: bool, motion: EyeMotion
+    ) -> DriftReport:
+        """Look at one rectified grey pair (H, W), its depth map, the nominal baseline and the eye's motion.
+
+        `left` and `right` must be rectified by `rig`. Frames with the servo moving are only reported on.
+        """
+        disparity = np.float32(depth.baseline_m * depth.pinhole.f_px) / depth.depth_m
+        offsets = row_offsets(left, right, disparity)
+        if moving or offsets.count < self.limits.points:
+            self._agreeing = 0
+            return self._report(offsets.median_px, offsets.count, self._fit, ())
+        rates = row_rates(offsets, depth.pinhole, depth.baseline_m, motion.v_rect_m_s, motion.w_rect_rad_s)
+        self._fit = self._rows.add(offsets, depth.pinhole, rates)
+        f_px = depth.pinhole.f_px
+        findings = self._judge_rows(offsets.median_px, f_px, nominal_m)
+        if not findings and offsets.median_px < 2 * self.limits.rows_px:
+            look = Look(depth.t_ns, left, right, disparity, depth.baseline_m, depth.pinhole, motion, self._late_s)
+            self._yaw.add(look)
+            findings += self._judge_yaw(f_px, nominal_m)
+        findings += self._judge_late()
+        report = self._report(offsets.median_px, offsets.count, self._fit, tuple(findings))
+        if report.rig_changed:
+            self._forget()
+        return report
+
+    @property
+    def _late_s(self) -> float:
+        """The time offset as measured when that is sharp, as declared otherwise."""
+        sharp = self._fit is not None and self._fit.late_sigma_s < 0.25 * self.limits.late_change_s
+        return self._fit.late_s if sharp and self._fit is not None else self.limits.late_s
+
+    def _forget(self) -> None:
+        """Start collecting anew, since what was collected belongs to another rectification."""
+        self._rows, self._yaw = RowWatch(memory=_MEMORY), YawWatch(self._uncertain)
+        self._fit = None
+        self._agreeing = 0
+
+    def _judge_rows(self, median_px: float, f_px: float, nominal_m: float) -> list[DriftFinding]:
+        fit, limits = self._fit, self.limits
+        assert fit is not None
+        turn_px = f_px * np.abs([fit.pitch_rad, 0.4 * fit.roll_rad])
+        sure = np.abs([fit.pitch_rad, fit.roll_rad]) > limits.strong_sigmas * np.array(
+            [fit.pitch_sigma_rad, fit.roll_sigma_rad]
+        )
+        if not np.any((turn_px > limits.rows_px) & sure):
+            self._agreeing = 0
+            return self._unexplained(fit, median_px)
+        self._agreeing += 1
+        if self._agreeing < limits.frames:
+            return []
+        turn = np.array([fit.pitch_rad if sure[0] else 0.0, 0.0, fit.roll_rad if sure[1] else 0.0])
+        text = f"the right eye has turned by {math.degrees(turn[0]):+.3f} deg in pitch and "
+        return [self._turn(Drift.TURNED, turn, nominal_m, f"{text}{math.degrees(turn[2]):+.3f} deg in roll")]
+
+    def _unexplained(self, fit: RowFit, median_px: float) -> list[DriftFinding]:
+        """Rows that differ though no turn and no time offset explains it."""
+        if fit.residual_px < 2 * self.limits.rows_px or fit.count < 5 * self.limits.points:
+            return []
+        return self._once(Drift.ROWS, f"rows differ by {median_px:.2f} px and no turn of an eye explains it")
+
+    def _judge_yaw(self, f_px: float, nominal_m: float) -> list[DriftFinding]:
+        yaw, sigma, limits = self._yaw.yaw_rad, self._yaw.sigma_rad, self.limits
+        sharp = sigma * f_px <= limits.yaw_sigma_px
+        needed = limits.strong_sigmas * (0.5 if sharp else 1.0)
+        if not abs(yaw) * f_px >= limits.yaw_px or abs(yaw) < needed * sigma:
+            return []
+        text = f"the right eye has turned by {math.degrees(yaw):+.3f} deg in yaw ({yaw * f_px:+.2f} px of disparity)"
+        return [self._turn(Drift.YAW, np.array([0.0, yaw, 0.0]), nominal_m, text)]
+
+    def _judge_late(self) -> list[DriftFinding]:
+        fit, limits = self._fit, self.limits
+        if fit is None or fit.late_sigma_s > 0.25 * limits.late_change_s or self._agreeing:
+            return []
+        if abs(fit.late_s - limits.late_s) < limits.late_change_s:
+            return []
+        text = f"the right eye exposes {fit.late_s * 1e3:.1f} ms late, not {limits.late_s * 1e3:.1f} ms as declared"
+        return self._once(Drift.LATE, text)
+
+    def _turn(self, what: Drift, turn_rect_rad: Array, nominal_m: float, text: str) -> DriftFinding:
+        """Turn the rig's right eye, unless it has turned so far in all that it must be broken."""
+        turned = turned_rig(self.rig, turn_rect_rad, nominal_m)
+        total = turn_between(self.rig, nominal_m, R_from_rotvec(turn_rect_rad)) @ self._turned
+        angle = math.acos(max(-1.0, min(1.0, (float(np.trace(total)) - 1.0) / 2.0)))
+        if angle > self.limits.largest_rad:
+            self._agreeing = 0
+            return DriftFinding(Drift.BROKEN, False, f"{text}: too far for a drift; land and calibrate again")
+        self.rig, self._turned = turned, total
+        return DriftFinding(what, True, f"{text}; corrected")
+
+    def _once(self, what: Drift, text: str) -> list[DriftFinding]:
+        if what in self._told:
+            return []
+        self._told.add(what)
+        return [DriftFinding(what, False, text)]
+
+    def _report(
+        self, rows_px: float, points: int, fit: RowFit | None, findings: tuple[DriftFinding, ...]
+    ) -> DriftReport:
+        known = fit or RowFit(0.0, math.inf, 0.0, math.inf, 0.0, math.inf, math.nan, 0)
+        return DriftReport(
+            rows_px=rows_px,
+            points=points,
+            pitch_rad=known.pitch_rad,
+            pitch_sigma_rad=known.pitch_sigma_rad,
+            roll_rad=known.roll_rad,
+            roll_sigma_rad=known.roll_sigma_rad,
+            yaw_rad=self._yaw.yaw_rad,
+            yaw_sigma_rad=self._yaw.sigma_rad,
+            late_s=known.late_s,
+            late_sigma_s=known.late_sigma_s,
+            findings=findings,
+        )
+
+
+def turned_rig(rig: RigModel, turn_rect_rad: Array, nominal_m: float) -> RigModel:
+    """Return the rig with its right eye turned by a rotation vector (3,) in the rectified axes at a baseline."""
+    turn = turn_between(rig, nominal_m, R_from_rotvec(turn_rect_rad))
+    return replace(rig, baselines=tuple(_turned(baseline, rig, turn) for baseline in rig.baselines))
+
+
+def turn_between(rig: RigModel, nominal_m: float, R_turn_rect: Array) -> Array:
+    """Return a turn given in rectified axes at a baseline in those of cam0."""
+    R_rect_cam0 = rectifying_rotation(rig.T_cam0_cam1(nominal_m)[:3, 3])
+    return np.asarray(R_rect_cam0.T @ R_turn_rect @ R_rect_cam0)
+
+
+def _turned(baseline: CalibratedBaseline, rig: RigModel, turn: Array) -> CalibratedBaseline:
+    T = rig.T_cam0_cam1(baseline.nominal_m)
+    made = CalibratedBaseline.from_pose(baseline.nominal_m, pose(turn @ T[:3, :3], T[:3, 3]))
+    return replace(baseline, q_cam0_cam1=made.q_cam0_cam1)

@@ -1,0 +1,35 @@
+"""How the rectified left eye moves, from what the autopilot says of the vehicle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from morpheyes_daemon.messages import VehicleState
+from morpheyes_daemon.transforms import Array, R_from_rpy, pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EyeMotion:
+    """Pose T_ned_rect (4, 4) of the rectified left eye; velocity (3,) m/s and turn rate (3,) rad/s in its axes."""
+
+    T_ned_rect: Array
+    v_rect_m_s: Array
+    w_rect_rad_s: Array
+
+    @classmethod
+    def still(cls, T_ned_rect: Array) -> EyeMotion:
+        """A vehicle that stands on the ground."""
+        return cls(T_ned_rect, np.zeros(3), np.zeros(3))
+
+
+def eye_motion(vehicle: VehicleState, T_frd_rig: Array, T_rig_rect: Array) -> EyeMotion:
+    """Return the motion of the rectified left eye; the vehicle's state is taken as of the exposure."""
+    R_ned_frd = R_from_rpy(vehicle.roll_rad, vehicle.pitch_rad, vehicle.yaw_rad)
+    T_frd_rect = T_frd_rig @ T_rig_rect
+    w_frd = np.array(vehicle.rates_frd_rad_s)
+    v_frd = R_ned_frd.T @ np.array(vehicle.v_ned_m_s) + np.cross(w_frd, T_frd_rect[:3, 3])
+    R_rect_frd = T_frd_rect[:3, :3].T
+    T_ned_rect = pose(R_ned_frd, np.array(vehicle.p_ned_m)) @ T_frd_rect
+    return EyeMotion(T_ned_rect, R_rect_frd @ v_frd, R_rect_frd @ w_frd)
