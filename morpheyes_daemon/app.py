@@ -217,6 +217,8 @@ class Daemon:
             limits = StickLimits(model.minimum, model.maximum, model.neutral)
         except DeviceError:
             return  # the doctor has just said so
+        if self.control is not None and self.control.model == model:
+            return  # the autopilot counts flight time in a parameter; the loop keeps what it has learned
         lean_rad = min(self.config.safety.max_lean_deg * 0.0174533, model.lean_max_rad)
         self.control = FlightControl(model, self._governor, VelocityTuning(max_lean_rad=lean_rad))
         self.gate.set_limits(limits)

@@ -262,7 +262,7 @@ def _mapped_axes(parameters: Mapping[str, float]) -> tuple[StickAxis, StickAxis,
     return roll.require_centred(), pitch.require_centred(), throttle, yaw.require_centred()
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _stopping_table(limits_m_s: tuple[float, ...], lean_max_rad: float, brake: Brake) -> StoppingTable:
     """The autopilot changes parameters of its own in flight; those that matter here seldom do."""
     return StoppingTable(list(limits_m_s), lean_max_rad, brake)

@@ -156,3 +156,10 @@ def test_nothing_free_means_no_speed() -> None:
 def test_unknown_height_takes_the_longer_stop() -> None:
     flow = MODELS[1]
     assert flow.stopping_distance_m(1.0, math.nan) > flow.stopping_distance_m(1.0, 1.0)
+
+
+def test_models_of_the_same_parameters_are_equal_and_others_are_not() -> None:
+    model = LoiterModel.from_parameters(copter_parameters())
+    assert model == LoiterModel.from_parameters(copter_parameters(STAT_FLTTIME=77))
+    assert model != LoiterModel.from_parameters(copter_parameters(LOIT_BRK_DELAY=0.1))
+    assert model != LoiterModel.from_parameters(copter_parameters(RC1_TRIM=1510))
