@@ -68,20 +68,20 @@ def look(panels: list[Panel], T_cam0_eye: Array, direction_eye: Array, f_px: flo
 
 
 def raw_image(
-    panels: list[Panel], lens: CameraIntrinsics, T_cam0_eye: Array, noise: float = 0.0, seed: int = 0
+    panels: list[Panel], lens: CameraIntrinsics, T_cam0_eye: Array, f_px: float, noise: float, seed: int
 ) -> Image:
-    """Return what an eye with a real lens sees (H, W) uint8."""
+    """Return what an eye with a real lens sees (H, W) uint8; `f_px` sets the grain of the textures for both eyes."""
     v, u = np.mgrid[0 : lens.height, 0 : lens.width].astype(np.float64)
     xy = lens.normalised_from_pixels(np.stack([u, v], axis=-1))
     direction = np.concatenate([xy, np.ones_like(u)[..., None]], axis=-1)
-    return developed(look(panels, T_cam0_eye, direction, lens.fx)[0], noise, seed)
+    return developed(look(panels, T_cam0_eye, direction, f_px)[0], noise, seed)
 
 
 def raw_pair(panels: list[Panel], rig: RigModel, baseline_m: float, noise: float = 0.0) -> tuple[Image, Image]:
     """Return the raw images of a rig at a nominal baseline."""
     return (
-        raw_image(panels, rig.cam0, np.eye(4), noise, 1),
-        raw_image(panels, rig.cam1, rig.T_cam0_cam1(baseline_m), noise, 2),
+        raw_image(panels, rig.cam0, np.eye(4), rig.cam0.fx, noise, 1),
+        raw_image(panels, rig.cam1, rig.T_cam0_cam1(baseline_m), rig.cam0.fx, noise, 2),
     )
 
 

@@ -20,18 +20,15 @@ from morpheyes_daemon.transforms import Array
 CELLS = (24, 18)
 """Columns and rows of cells; each gives its best-textured point."""
 
-PATCH_RADIUS_PX = 4
-REACH_PX = 3
-"""Largest row offset that is found."""
+WINDOW_PX = 11
+"""Side of the patches that are compared."""
 
-BLUR_PX = 1.0
+REACH_PX = 6.0
+SIDEWAYS_PX = 1.5
+"""Largest row offset that is found, and how far the matcher's disparity may be improved on."""
 
-MIN_CONTRAST = 5.0
-"""Least standard deviation of a blurred patch in grey levels; the sensor's noise is below 1 then."""
-
-MIN_CORRELATION = 0.85
-"""Least normalised correlation of the best match."""
-
+RETURN_PX = 0.3
+"""How near the way back from the right eye must end."""
 
 MIN_POINTS = 12
 """Fewer points than this explain nothing."""
@@ -74,29 +71,46 @@ class RowFit:
 
 
 def row_offsets(left: Image, right: Image, disparity_px: FloatMap) -> RowOffsets:
-    """Measure row offsets of a rectified grey pair (H, W) with its disparity map (H, W), NaN unknown."""
+    """Measure row offsets of a rectified grey pair (H, W) with its disparity map (H, W), NaN unknown.
+
+    Points are followed from eye to eye and back by Lucas and Kanade's method, beginning at the disparity and free
+    to move both ways: kept to the row direction, an oblique texture would trade columns for rows.
+    """
     uv = _textured_points(left, disparity_px)
-    d = disparity_px[uv[:, 1], uv[:, 0]].astype(np.float64)
-    r = PATCH_RADIUS_PX
-    inside = (uv[:, 0] - d >= r) & (uv[:, 0] - d < left.shape[1] - r - 1)
-    uv, d = uv[inside], d[inside]
-    if not len(uv):
-        return RowOffsets(uv.astype(np.float64), d, np.empty(0))
-    # without aliasing a step of a fraction of a row shows in grey levels as one
-    soft = [cv2.GaussianBlur(eye, (0, 0), BLUR_PX) for eye in (left, right)]
-    patches, strips = _gathered(np.asarray(soft[0], np.uint8), np.asarray(soft[1], np.uint8), uv, d)
-    scores = _correlations(patches, strips)
-    best = scores.argmax(axis=1)
-    points = np.arange(len(uv))
-    sure = (best > 0) & (best < 2 * REACH_PX) & (scores[points, best] >= MIN_CORRELATION)
-    points, best = points[sure], best[sure]
-    offset = best - REACH_PX + _remainder(patches[points], strips[points], best)
-    return RowOffsets(uv[points].astype(np.float64), d[points], offset)
+    d = disparity_px[uv[:, 1], uv[:, 0]]
+    inside = (uv[:, 0] - d >= WINDOW_PX // 2) & (uv[:, 0] - d < left.shape[1] - WINDOW_PX // 2)
+    start, d = uv[inside].astype(np.float32), d[inside]
+    if not len(start):
+        return RowOffsets(np.empty((0, 2)), np.empty(0), np.empty(0))
+    expected = start - np.stack([d, np.zeros_like(d)], axis=1)
+    found, good = _followed(left, right, start, expected)
+    back, returned = _followed(right, left, found, start)
+    aside, down = (found - expected).T
+    good &= returned & (np.abs(back - start).max(axis=1) < RETURN_PX)
+    good &= (np.abs(aside) < SIDEWAYS_PX) & (np.abs(down) < REACH_PX)
+    return RowOffsets(
+        start[good].astype(np.float64), (d - aside)[good].astype(np.float64), down[good].astype(np.float64)
+    )
+
+
+def _followed(first: Image, second: Image, points: FloatMap, guess: FloatMap) -> tuple[FloatMap, NDArray[np.bool_]]:
+    """Return where points (n, 2) of the first image are in the second, beginning at `guess`, and which were found."""
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        points,
+        guess.copy(),
+        winSize=(WINDOW_PX, WINDOW_PX),
+        maxLevel=1,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-3,
+    )
+    return np.asarray(found, dtype=np.float32), np.asarray(status).ravel() > 0
 
 
 def _textured_points(left: Image, disparity_px: FloatMap) -> NDArray[np.intp]:
     """Return (n, 2) the pixel of each cell with the strongest vertical gradient and a disparity."""
-    margin = PATCH_RADIUS_PX + REACH_PX
+    margin = WINDOW_PX // 2
     height, width = ((size - 2 * margin) // cells for size, cells in zip(left.shape, CELLS[::-1], strict=True))
     if height < 1 or width < 1:
         return np.empty((0, 2), dtype=np.intp)
@@ -108,53 +122,6 @@ def _textured_points(left: Image, disparity_px: FloatMap) -> NDArray[np.intp]:
     row, column = np.nonzero(cells.max(axis=2) > 0)
     place = best[row, column]
     return np.stack([margin + column * width + place % width, margin + row * height + place // width], axis=1)
-
-
-def _gathered(left: Image, right: Image, uv: NDArray[np.intp], d_px: Array) -> tuple[Array, Array]:
-    """Return around each point the left patch with one more row above and below, and the right eye's strip.
-
-    The strip (n, size + 2 REACH_PX, size) is taken at the disparity, between pixels by linear interpolation.
-    """
-    r = PATCH_RADIUS_PX
-    u, v = uv[:, 0, None, None], uv[:, 1, None, None]
-    across, down = np.arange(-r, r + 1)[None, None, :], np.arange(-r - REACH_PX, r + REACH_PX + 1)[None, :, None]
-    patches = left[v + down[:, REACH_PX - 1 : 1 - REACH_PX], u + across].astype(np.float64)
-    start = uv[:, 0] - d_px
-    whole = np.floor(start).astype(np.intp)[:, None, None]
-    share = (start - np.floor(start))[:, None, None]
-    near = right[v + down, whole + across].astype(np.float64)
-    far = right[v + down, whole + across + 1].astype(np.float64)
-    return patches, near + share * (far - near)
-
-
-def _correlations(patches: Array, strips: Array) -> Array:
-    """Return the normalised correlation (n, 2 REACH_PX + 1) of each left patch with the strip at each row offset."""
-    patch = _levelled(patches[:, 1:-1])
-    size = patch.shape[1]
-    windows = _levelled(np.stack([strips[:, k : k + size] for k in range(2 * REACH_PX + 1)], axis=1))
-    contrast = np.sqrt((patch**2).sum(axis=(1, 2)))
-    product = np.einsum("nij,nkij->nk", patch, windows)
-    scores = product / np.maximum(contrast[:, None] * np.sqrt((windows**2).sum(axis=(2, 3))), 1e-9)
-    return np.where(contrast[:, None] >= MIN_CONTRAST * size, scores, -1.0)
-
-
-def _remainder(patches: Array, strips: Array, best: NDArray[np.intp]) -> Array:
-    """Return the part of the row offset (n,) beyond the whole rows `best`, in (-1, 1).
-
-    One least-squares step on the mean of both eyes' vertical gradients, which is exact to second order.
-    """
-    size = patches.shape[1] - 2
-    rows = best[:, None] + np.arange(-1, size + 1)
-    window = np.take_along_axis(strips, rows[:, :, None], axis=1)
-    patch, middle = _levelled(patches[:, 1:-1]), _levelled(window[:, 1:-1])
-    gain = (patch * middle).sum(axis=(1, 2), keepdims=True) / (middle**2).sum(axis=(1, 2), keepdims=True)
-    slope = _levelled(0.25 * (patches[:, 2:] - patches[:, :-2]) + 0.25 * gain * (window[:, 2:] - window[:, :-2]))
-    step = (slope * (patch - gain * middle)).sum(axis=(1, 2)) / ((slope**2).sum(axis=(1, 2)) + 1e-9)
-    return np.asarray(np.clip(step, -1.0, 1.0))
-
-
-def _levelled(patches: Array) -> Array:
-    return np.asarray(patches - patches.mean(axis=(-2, -1), keepdims=True))
 
 
 def row_rates(

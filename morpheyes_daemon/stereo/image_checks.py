@@ -98,16 +98,15 @@ def matching_faults(
     enough = max(limits.better_share, limits.better_gain * _matched_share(small_left, small_right))
     if _matched_share(small_right, small_left) >= enough:
         return {ImageFault.SWAPPED}
-    rows = row_shift(small_left, small_right)
-    if rows and _matched_share(small_left, np.roll(small_right, -rows, axis=0)) >= enough:
-        return {ImageFault.MISALIGNED}
-    return set()
+    about = row_shift(small_left, small_right)
+    tried = (np.roll(small_right, -rows, axis=0) for rows in (about, about - 1, about + 1) if rows)
+    return {ImageFault.MISALIGNED} if any(_matched_share(small_left, eye) >= enough for eye in tried) else set()
 
 
 def row_shift(left: Image, right: Image) -> int:
-    """Return by how many rows the right image (H, W) lies lower than the left, from their mean vertical gradients.
+    """Return by about how many rows the right image (H, W) lies lower, from the rows' mean vertical gradients.
 
-    Parallax moves things within their rows, so the rows' means keep their pattern.
+    Parallax moves things within their rows, so the means keep their pattern, to a row or so.
     """
     profiles = [cv2.Sobel(eye, cv2.CV_32F, 0, 1).mean(axis=1, dtype=np.float64) for eye in (left, right)]
     edge = MAX_SHIFT_ROWS

@@ -1,0 +1,133 @@
+"""Bad images are told from good ones, and good ones are let through."""
+
+import math
+
+import numpy as np
+import pytest
+
+from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.stereo.epipolar import RowFit, RowOffsets
+from morpheyes_daemon.stereo.image_checks import (
+    FrozenCheck,
+    ImageFault,
+    exposure_faults,
+    matching_faults,
+    row_faults,
+    row_shift,
+)
+from morpheyes_daemon.stereo.matching import match
+from tests.panels import Panel, ideal_pair
+
+PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)
+PANELS = [Panel(5.0, slope_x=0.3), Panel(2.5, x_m=(-0.3, 0.6), y_m=(-0.5, 0.3), seed=3)]
+CALM = RowFit(0.0, 1e-3, 0.0, 1e-5, 0.0, 1e-5, 0.1, 300)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    left, right, _ = ideal_pair(PANELS, PINHOLE, 0.2, 1.5)
+    return left, right
+
+
+def valid_fraction(left, right):
+    return float(np.isfinite(match(left, right, 80).disparity_px).mean())
+
+
+def test_a_good_pair_has_no_fault(pair):
+    assert exposure_faults(*pair) == set()
+    assert matching_faults(*pair, valid_fraction(*pair)) == set()
+    # not even when something else says that depth is scarce
+    assert matching_faults(*pair, 0.0) == set()
+
+
+def test_the_same_image_again_is_frozen_in_either_eye(pair):
+    left, right = pair
+    noisy = left ^ np.uint8(1)
+    check = FrozenCheck()
+    assert not check.check(left, right)
+    assert not check.check(noisy, right[::-1])
+    assert check.check(left, right[::-1])
+    assert check.check(left, right)
+    assert not check.check(left[:100], right[:100])
+
+
+def test_one_changed_pixel_is_not_frozen(pair):
+    left, right = pair
+    check = FrozenCheck()
+    check.check(left, right)
+    other_left, other_right = left.copy(), right.copy()
+    other_left[5, 7] ^= 1
+    other_right[9, 9] ^= 1
+    assert not check.check(other_left, other_right)
+
+
+@pytest.mark.parametrize("eye", [0, 1])
+@pytest.mark.parametrize(
+    ("spoil", "fault"),
+    [
+        (lambda image: image // 32, ImageFault.DARK),
+        (lambda image: np.zeros_like(image), ImageFault.DARK),
+        (lambda image: np.where(image > 90, 255, image), ImageFault.BURNT),
+        (lambda image: np.full_like(image, 120), ImageFault.BLANK),
+    ],
+)
+def test_an_eye_that_sees_nothing_is_told(pair, eye, spoil, fault):
+    images = list(pair)
+    images[eye] = spoil(images[eye]).astype(np.uint8)
+    assert exposure_faults(*images) == {fault}
+
+
+def test_dusk_and_bright_sky_are_no_faults(pair):
+    dusk = tuple(image // 8 for image in pair)
+    assert exposure_faults(*dusk) == set()
+    sky = tuple(np.where(np.arange(240)[:, None] < 90, 255, image).astype(np.uint8) for image in pair)
+    assert exposure_faults(*sky) == set()
+
+
+def test_swapped_eyes_are_told(pair):
+    left, right = pair
+    assert matching_faults(right, left, valid_fraction(right, left)) == {ImageFault.SWAPPED}
+
+
+@pytest.mark.parametrize("rows", [-14, 8, 20])
+def test_rows_far_off_are_told(pair, rows):
+    left, right = pair
+    off = np.roll(right, rows, axis=0)
+    assert matching_faults(left, off, valid_fraction(left, off)) == {ImageFault.MISALIGNED}
+
+
+@pytest.mark.parametrize("rows", [-7, 0, 5])
+def test_the_row_shift_is_found_in_spite_of_parallax(pair, rows):
+    left, right = pair
+    assert abs(row_shift(left, np.roll(right, rows, axis=0)) - rows) <= 1
+
+
+def test_scarce_depth_alone_is_no_fault():
+    bare = ideal_pair([Panel(3.0, contrast=0.02)], PINHOLE, 0.2, 1.5)[:2]
+    too_near = ideal_pair([Panel(0.25)], PINHOLE, 0.3, 1.5)[:2]
+    for left, right in (bare, too_near):
+        assert matching_faults(left, right, valid_fraction(left, right)) == set()
+
+
+def offsets_of(dv_px, count=200):
+    return RowOffsets(np.zeros((count, 2)), np.ones(count), np.full(count, dv_px))
+
+
+def test_rows_off_by_a_little_are_misaligned_and_by_less_are_not():
+    assert row_faults(offsets_of(2.0), CALM, 0.002) == {ImageFault.MISALIGNED}
+    assert row_faults(offsets_of(-2.0), CALM, 0.002) == {ImageFault.MISALIGNED}
+    assert row_faults(offsets_of(0.5), CALM, 0.002) == set()
+    assert row_faults(offsets_of(2.0, count=10), CALM, 0.002) == set()
+
+
+@pytest.mark.parametrize(
+    ("late_s", "sigma_s", "told"),
+    [(0.006, 2e-4, True), (-0.006, 2e-4, True), (0.0025, 2e-4, False), (0.006, 2e-3, False), (0.5, math.inf, False)],
+)
+def test_only_sure_lateness_beyond_what_is_declared_is_a_fault(late_s, sigma_s, told):
+    fit = RowFit(late_s, sigma_s, 0.0, 1e-5, 0.0, 1e-5, 0.1, 300)
+    assert row_faults(offsets_of(0.2), fit, 0.002) == ({ImageFault.DESYNCHRONIZED} if told else set())
+
+
+def test_every_fault_says_what_it_is():
+    assert all(fault.text and fault.value for fault in ImageFault)
