@@ -21,7 +21,7 @@ from morpheyes_daemon.app import Daemon
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, running_clock, stopwatch_s, wall_time_s
 from morpheyes_daemon.config import AutopilotConfig, SerialServoConfig, VehicleConfig
-from morpheyes_daemon.errors import DeviceLostError
+from morpheyes_daemon.errors import DeviceLostError, DeviceTimeoutError
 from morpheyes_daemon.experiments.flight import FlightPlan, Progress, Summary, Tally, summarize_flight
 from morpheyes_daemon.experiments.flight_outputs import FILES
 from morpheyes_daemon.experiments.judge import Verdict
@@ -63,6 +63,14 @@ class Simulator:
         self._said: tuple[Any, Any] | None = None
         loop.add_reader(pipe.fileno(), self._read)
 
+    async def get_ready(self) -> Ready:
+        """Wait until everything is served; raises what kept it from that."""
+        try:
+            async with asyncio.timeout(READY_LIMIT_S):
+                return await asyncio.shield(self.ready)
+        except TimeoutError:
+            raise DeviceTimeoutError(f"the simulator did not get ready within {READY_LIMIT_S:.0f} s.") from None
+
     def tell(self, out: GateOutput) -> None:
         """Pass on the daemon's state when it has changed."""
         if self._said != (out.state, out.reason):
@@ -101,7 +109,8 @@ class Simulator:
                 self._take(self._pipe.recv())
         except (EOFError, OSError):
             asyncio.get_running_loop().remove_reader(self._pipe.fileno())
-            self._fail(DeviceLostError("the simulator process died; its last words are on standard error."))
+            self._process.join(1.0)
+            self._fail(DeviceLostError(f"the simulator process died (exit code {self._process.exitcode})."))
 
     def _take(self, message: object) -> None:
         if isinstance(message, Progress):
@@ -117,6 +126,7 @@ class Simulator:
         for future in (self.ready, self.verdict):
             if not future.done():
                 future.set_exception(error)
+                future.exception()  # seen: whoever waits raises it, and nobody need wait
 
 
 @asynccontextmanager
@@ -200,8 +210,7 @@ async def realtime_daemon(
         address = f"unix:{place}/frames"
         job = SimulatorJob(plan.scenario, plan.config, address, plan.limit_s, plan.render_threads, autopilot)
         async with simulator_process(job, progress) as simulator:
-            async with asyncio.timeout(READY_LIMIT_S):
-                ready = await simulator.ready
+            ready = await simulator.get_ready()
             config = device_config(plan, ready, address)
             parts = build_parts(config, plan.mission, clock, events, film=True)
             worker = parts.worker

@@ -29,10 +29,12 @@ from morpheyes_daemon.messages import RawPair
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.simulation.autopilot_core import TICK_NS
 from morpheyes_daemon.simulation.frame_server import FrameServer
 from morpheyes_daemon.simulation.pseudo_terminal import PseudoTerminal
 from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.serve_mavlink import MavlinkServer
+from morpheyes_daemon.simulation.vehicle import Truth
 
 EXPOSURE_LAG_NS = 10 * MS
 """A pose is asked for this long after its moment, so that it lies between two that are known."""
@@ -83,12 +85,13 @@ class Heard:
     def __init__(self, radio: Radio) -> None:
         self._radio = radio
         self.gate: Latest[GateOutput] = Latest("gate")
-        self.ended = asyncio.Event()
+        self.booted, self.ended = asyncio.Event(), asyncio.Event()
         self.state, self.reason, self.since_ns = State.BOOT, Reason.STARTED, 0
 
     def take(self, message: GateOutput | PilotAct | End) -> None:
         """Take a message; a gate output is sent whenever state or reason change."""
         if isinstance(message, End):
+            self.booted.set()
             self.ended.set()
         elif isinstance(message, PilotAct):
             self._act(message)
@@ -103,6 +106,7 @@ class Heard:
             self._radio.mode_switch(ALT_HOLD_POSITION)
 
     def _note(self, message: GateOutput) -> None:
+        self.booted.set()
         if message.state is not self.state:
             self.since_ns = message.t_ns
         self.state, self.reason = message.state, message.reason or Reason.ENGAGED
@@ -127,10 +131,20 @@ async def _simulate(job: SimulatorJob, pipe: Connection) -> None:
             await _fly(job, pipe, stage, crew, job.sitl)
             await crew.land()
         return
-    stage = Stage(job.scenario, job.config, clock, job.render_threads)
+    stage = TwinStage(job.scenario, job.config, clock, job.render_threads)
     station = make_crew(stage)
     async with MavlinkServer(stage.autopilot, port=0) as server, _background(stage.autopilot.run(), station.run()):
         await _fly(job, pipe, stage, station, server.url)
+
+
+class TwinStage(Stage):
+    """A stage whose twin is brought up to the moment it is asked about, should the loop have been held up."""
+
+    def truth(self, t_ns: int) -> Truth:
+        """Return where the vehicle really was; in the event loop only."""
+        while t_ns - self.autopilot.autopilot.t_ns >= TICK_NS:
+            self.autopilot.advance(t_ns)
+        return super().truth(t_ns)
 
 
 async def _fly(job: SimulatorJob, pipe: Connection, stage: Stage, crew: Crew, url: str) -> None:
@@ -146,6 +160,7 @@ async def _fly(job: SimulatorJob, pipe: Connection, stage: Stage, crew: Crew, ur
                 await exposures.next()  # compiles what is not compiled yet
                 await frames.listening.wait()
                 pipe.send(Ready(url, f"serial:{port.path}:115200", scene_of(stage.world).as_json()))
+                await heard.booted.wait()  # or it would find the vehicle flying, and only observe
                 await _judge(job, pipe, stage, crew, heard)
                 await heard.ended.wait()
                 crew.disengage()
@@ -185,7 +200,9 @@ class Exposures:
         """Expose now and return the pair."""
         stage = self._stage
         self._seq += 1
-        t_ns = stage.clock.now_ns() - stage.delivery_ns - EXPOSURE_LAG_NS
+        now_ns = stage.clock.now_ns()
+        stage.truth(now_ns)
+        t_ns = now_ns - stage.delivery_ns - EXPOSURE_LAG_NS
         return await asyncio.to_thread(stage.exposure(self._seq, t_ns))
 
 

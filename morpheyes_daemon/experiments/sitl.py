@@ -21,7 +21,8 @@ from morpheyes_daemon.simulation.sitl_vehicle import SitlVehicle
 FIRST_PORT, CREW_PORT, TRUTH_PORT = 5760, 2, 3
 """SITL's serial0 is tcp 5760 (plus 10 per instance); serial1 and serial2 are two and three above."""
 RECOMMENDED_HERE = {name: value for name, value in RECOMMENDED.items() if name != "RNGFND1_TYPE"}
-"""The rangefinder is SITL's own."""
+RECOMMENDED_HERE[f"RC{Radio.SWITCH_CHANNEL}_OPTION"] = 0.0
+"""The rangefinder is SITL's own; the engage switch must do nothing else."""
 
 @contextlib.asynccontextmanager
 async def open_sitl(url: str, clock: Clock) -> AsyncIterator[tuple[SitlVehicle, MavsdkCrew]]:
@@ -38,6 +39,7 @@ async def open_sitl(url: str, clock: Clock) -> AsyncIterator[tuple[SitlVehicle, 
         async with MavsdkCrew(radio, f"tcp:{host}:{port + CREW_PORT}", clock) as crew:
             await vehicle.listen()
             await crew.set_parameters(RECOMMENDED_HERE)
+            crew.without_gps = await crew.read_parameter("GPS1_TYPE") == 0.0
             yield vehicle, crew
     finally:
         sending.cancel()

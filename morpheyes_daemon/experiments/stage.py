@@ -120,7 +120,7 @@ class Stage:
         self.camera.close()
 
     def _pose_at(self, t_ns: int) -> Array:
-        return self.truth(t_ns).T_ned_frd
+        return self.vehicle.truth_at(t_ns).T_ned_frd
 
 
 class StageCamera:

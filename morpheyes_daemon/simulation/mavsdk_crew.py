@@ -37,7 +37,7 @@ SITL_RC_PORT = 5501
 """ArduPilot SITL takes 8 or 16 little-endian uint16 pulse widths here (plus 10 per instance)."""
 
 _ARMED, _CUSTOM_MODE, _REAL32 = 128, 1, 9
-_PREARM_CHECK, _POS_HORIZ_REL = 0x10000000, 0x08
+_PREARM_CHECK, _POS_HORIZ_REL, _CONSTANT_POSITION = 0x10000000, 0x08, 0x80
 _SET_MODE, _SET_INTERVAL = 176, 511
 _HEARD = ("HEARTBEAT", "SYS_STATUS", "LOCAL_POSITION_NED", "EKF_STATUS_REPORT", "STATUSTEXT", "PARAM_VALUE")
 _STREAMS_US = {1: 200_000, 32: 50_000, 193: 200_000}
@@ -72,7 +72,7 @@ class MavsdkCrew:
         if not url.startswith("tcp:"):
             raise ConfigError(f"{url}: the ground crew connects by tcp:HOST:PORT.")
         self._radio, self._clock, self._url = radio, clock, url
-        self._without_gps = without_gps
+        self.without_gps = without_gps
         self._native: Mavsdk | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self.latest: dict[str, dict[str, Any]] = {}
@@ -129,6 +129,14 @@ class MavsdkCrew:
             confirmed = partial(self._has_parameter, name, value)
             await self._until(confirmed, 10.0, f"take {name}", partial(self._send, "PARAM_SET", message))
 
+    async def read_parameter(self, name: str) -> float:
+        """Return a parameter; raises DeviceTimeoutError when the autopilot does not know it."""
+        fields = {"target_system": 1, "target_component": 1, "param_id": name, "param_index": -1}
+        self.parameters.pop(name, None)
+        ask = partial(self._send, "PARAM_REQUEST_READ", fields)
+        await self._until(lambda: name in self.parameters, 10.0, f"tell {name}", ask)
+        return self.parameters[name]
+
     def _has_parameter(self, name: str, value: float) -> bool:
         kept = self.parameters.get(name)
         return kept is not None and math.isclose(kept, value, rel_tol=1e-5, abs_tol=1e-6)
@@ -165,7 +173,7 @@ class MavsdkCrew:
 
     async def _prepare(self) -> None:
         flags = self.latest.get("EKF_STATUS_REPORT", {}).get("flags", 0)
-        if self._without_gps and flags & _POS_HORIZ_REL:
+        if self.without_gps and flags & _POS_HORIZ_REL and not flags & _CONSTANT_POSITION:
             keys = ("latitude", "longitude", "altitude")
             fields = {"target_system": 1, **dict(zip(keys, ORIGIN, strict=True))}
             await self._send("SET_GPS_GLOBAL_ORIGIN", fields)

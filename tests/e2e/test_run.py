@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import socket
 import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
+import aiohttp
 import cv2
 import numpy as np
 import pytest
@@ -99,6 +101,24 @@ async def running(config: Path) -> AsyncIterator[Running]:
         await process.wait()
 
 
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+async def depth_on_the_page(port: int, limit_s: float = 240.0) -> None:
+    """Ask the daemon's page until it shows a depth with something in it."""
+    async with asyncio.timeout(limit_s), aiohttp.ClientSession() as session:
+        while True:
+            with suppress(aiohttp.ClientConnectionError):
+                async with session.get(f"http://127.0.0.1:{port}/api/state") as answer:
+                    shown = await answer.json()
+                    if shown["depth"] is not None:
+                        return
+            await asyncio.sleep(0.2)
+
+
 def the_log(folder: Path) -> Flight:
     (path,) = (folder / "flights").glob("*.mcap")
     return read_flight(path)
@@ -145,22 +165,27 @@ async def test_what_is_missing_is_waited_for_and_said_once(tmp_path: Path, scene
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("images", ["synthetic", "stereopi_scenes"])
 async def test_depth_lives_and_no_stick_is_sent_as_long_as_nobody_engages(
     tmp_path: Path, scenes: Path, images: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = scenes if images == "synthetic" else real_images(images)
     twin = AutopilotTwin(Vehicle(), MonotonicClock())
-    overrides: list[object] = []
+    overrides: list[list[int]] = []
     monkeypatch.setattr(twin.autopilot.rc, "override", lambda t_ns, values: overrides.append(values))
     async with MavlinkServer(twin, port=0) as server:
         beat = asyncio.create_task(twin.run())
-        async with running(write_config(tmp_path, folder, server.url)) as daemon:
-            await daemon.until(lambda said: any("preflight to standby" in line for line in said))
+        config, port = write_config(tmp_path, folder, server.url), free_port()
+        with config.open("a") as file:
+            file.write(f"dashboard: {{enabled: true, port: {port}}}\n")
+        async with running(config) as daemon:
+            await daemon.until(lambda said: any("is heard" in line for line in said))
+            await depth_on_the_page(port)
             assert await daemon.end() == 0
         beat.cancel()
         await asyncio.gather(beat, return_exceptions=True)
-    assert overrides == []
+    assert all(values[:4] == [0, 0, 0, 0] for values in overrides)  # a release on the way out, and no stick
     log = the_log(tmp_path)
     depths = [value for value in log.values("perception") if isinstance(value, Perception)]
     assert len(depths) >= 1
