@@ -1,0 +1,135 @@
+"""Leading a person with a board: which pictures are worth keeping, and where to hold the board next.
+
+A pair is kept when both eyes see the board, it is held still, and it shows something that the kept ones do not: other
+parts of the image, another distance, another tilt. Taking the pictures is somebody else's job.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from morpheyes_daemon.calibration.boards import Board, aligned, find_corners, spacing_px
+from morpheyes_daemon.calibration.coverage import CELLS, cell_of, count_cells, empty_corners
+from morpheyes_daemon.messages import Image
+from morpheyes_daemon.transforms import Array
+
+_STILL_PX = 0.7
+"""Corners that move by more between two frames blur, and the eyes expose at different times."""
+_NEW_CELLS = 3
+_NEW_DISTANCE = 1.2
+_NEW_TILT = 0.12
+_FAR_SQUARE_PX, _NEAR_SHARE = 14.0, 0.55
+
+
+@dataclass(frozen=True)
+class Hint:
+    """What came of one pair: kept or not, and what to tell the person."""
+
+    kept: bool
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """One board as seen: corners, mean square in pixels, and how unequal its sides look (tilt about both axes)."""
+
+    left: Array
+    right: Array
+    square_px: float
+    tilt: Array
+
+
+@dataclass
+class CaptureGuide:
+    """Judges pairs at one baseline; `wanted` kept pairs make it complete."""
+
+    board: Board
+    size: tuple[int, int]
+    wanted: int = 12
+    _kept: list[_Seen] = field(default_factory=list)
+    _last: Array | None = None
+
+    @property
+    def kept(self) -> int:
+        """Pairs kept so far."""
+        return len(self._kept)
+
+    @property
+    def complete(self) -> bool:
+        """Enough pairs are kept."""
+        return self.kept >= self.wanted
+
+    def covered(self, eye: int) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
+        """Return corners kept per cell (rows, columns) of the left (0) or right (1) image."""
+        pixels = [(one.left, one.right)[eye] for one in self._kept]
+        return count_cells(np.array(pixels), self.size) if pixels else np.zeros(CELLS[::-1], dtype=np.int64)
+
+    def consider(self, left: Image, right: Image) -> Hint:
+        """Judge one raw pair."""
+        seen_left, seen_right = find_corners(left, self.board), find_corners(right, self.board)
+        if seen_left is None or seen_right is None:
+            self._last = None
+            return Hint(False, self._blind(seen_left is not None, seen_right is not None))
+        still = self._last is not None and float(np.nanmax(np.abs(seen_left - self._last))) < _STILL_PX
+        self._last = seen_left
+        if not still:
+            return Hint(False, "hold it still")
+        seen = _describe(seen_left, aligned(seen_left, seen_right, self.board), self.board)
+        if not self._tells_more(seen):
+            return Hint(False, self.advice())
+        self._kept.append(seen)
+        return Hint(True, "kept" if not self.complete else "kept; this baseline is complete")
+
+    def advice(self) -> str:
+        """Return where to hold the board next."""
+        for eye, name in ((0, "left"), (1, "right")):
+            empty = empty_corners(self.covered(eye))
+            if self.kept >= 2 and empty:
+                return f"move it to the {empty[0]} of the {name} picture"
+        squares = [one.square_px for one in self._kept]
+        width = self.size[0] / (self.board.columns + 1)
+        if squares and max(squares) < _NEAR_SHARE * width:
+            return "bring it nearer"
+        if squares and min(squares) > _FAR_SQUARE_PX:
+            return "take it farther away"
+        return "tilt it another way or move it to a new place"
+
+    def _blind(self, left: bool, right: bool) -> str:
+        if left or right:
+            return f"only the {'left' if left else 'right'} eye sees the whole board"
+        return "no board in sight"
+
+    def _tells_more(self, seen: _Seen) -> bool:
+        if not self._kept:
+            return True
+        if _fresh_cells(seen.left, self.covered(0), self.size) >= _NEW_CELLS:
+            return True
+        if _fresh_cells(seen.right, self.covered(1), self.size) >= _NEW_CELLS:
+            return True
+        return not any(_alike(seen, other) for other in self._kept)
+
+
+def _describe(left: Array, right: Array, board: Board) -> _Seen:
+    grid = left.reshape(board.rows, board.columns, 2)
+    down = np.linalg.norm(np.diff(grid, axis=0), axis=-1)
+    along = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
+    half_row, half_column = board.rows // 2, board.columns // 2
+    tilt = [
+        np.log(np.nanmean(along[:half_row]) / np.nanmean(along[half_row:])),
+        np.log(np.nanmean(down[:, :half_column]) / np.nanmean(down[:, half_column:])),
+        np.log(np.nanmean(along) / np.nanmean(down)),
+    ]
+    return _Seen(left, right, float(np.nanmean(spacing_px(left, board))), np.array(tilt))
+
+
+def _alike(one: _Seen, other: _Seen) -> bool:
+    near = 1 / _NEW_DISTANCE < one.square_px / other.square_px < _NEW_DISTANCE
+    moved = float(np.linalg.norm(np.nanmean(one.left - other.left, axis=0)))
+    return bool(near and moved < 3 * one.square_px and np.all(np.abs(one.tilt - other.tilt) < _NEW_TILT))
+
+
+def _fresh_cells(pixels: Array, counts: np.ndarray[tuple[int, int], np.dtype[np.int64]], size: tuple[int, int]) -> int:
+    column, row = cell_of(pixels[np.isfinite(pixels[:, 0])], size)
+    return len({(int(r), int(c)) for r, c in zip(row, column, strict=True) if counts[r, c] == 0})
