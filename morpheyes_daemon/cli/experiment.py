@@ -32,7 +32,10 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print rows and cells as JSON and nothing else.")] = False,
 ) -> None:
     """Fly a mission over many seeds in lockstep; continues where it stopped."""
+    from morpheyes_daemon.cli.extras import require_simulator
     from morpheyes_daemon.cli.progress import progress_line
+
+    require_simulator()
     from morpheyes_daemon.experiments.campaign import Campaign, cells, parse_seeds, run_campaign
     from morpheyes_daemon.experiments.plan import make_plan
 

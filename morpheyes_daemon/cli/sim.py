@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -43,7 +44,13 @@ def command(
 
     Exit code 0 when the goal was reached (or a gap rightly refused), 1 when not, 2 on wrong usage.
     """
+    from morpheyes_daemon.cli.extras import require_simulator
     from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.errors import UsageError
+
+    if autopilot is not None and not re.fullmatch(r"tcp:[^:/]+:\d+", autopilot):
+        raise UsageError(f"--autopilot {autopilot}: write tcp:HOST:PORT, the first port of the SITL, mostly 5760.")
+    require_simulator()
     from morpheyes_daemon.experiments.plan import make_plan
 
     with progress_line() as report:

@@ -1,0 +1,16 @@
+"""Optional packages: a command that needs some asks here first, so that their absence is one sentence."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from morpheyes_daemon.errors import UsageError
+
+
+def require_simulator() -> None:
+    """Raise UsageError when the packages of the `sim` extra are missing."""
+    missing = [name for name in ("av", "joblib", "numba") if find_spec(name) is None]
+    if missing:
+        raise UsageError(
+            f"the simulator needs {', '.join(missing)}; install it with: pip install 'morpheyes-daemon[sim]'."
+        )
