@@ -22,7 +22,8 @@ from morpheyes_daemon.simulation.species import BROADLEAVES, CONIFERS, Layer, Sp
 from morpheyes_daemon.transforms import Array
 
 LIGHT_MAP_PX = 2048
-FAR_GROUND_M = 600.0
+FAR_GROUND_M = 110.0
+"""The ground goes on this far past the trees; from there on the woods of the sky take over."""
 
 RANGES = ((0.0, 16.0), (16.0, 40.0), (40.0, 110.0))
 """Distances in metres at which the levels of detail of foliage are drawn."""
@@ -151,7 +152,7 @@ def build_scene(world: ForestWorld, seed: int) -> tuple[Scene, list[Tree]]:
         "ground": Material("grass", (0.4, 0.4), "light_map", across),
         **{f"bark{k}": Material(f"bark{k}", (1.0, 1.0), "dapple", (0.31, 0.13)) for k in range(3)},
         **{f"leaves{k}": Material(f"leaves{k}", (0.9, 0.9)) for k in range(2)},
-        "sky": Material("sky", (1.0, 1.0), sky=True),
+        "sky": Material("sky", (2.0, 1.0), sky=True),
     }
     return Scene(parts, materials, images, light, sky_mesh()), trees
 
@@ -162,14 +163,15 @@ def _length(world: ForestWorld) -> float:
 
 def sky_mesh() -> Mesh:
     """Return the dome that follows the eye."""
-    vertices, uv, _, triangles = meshes.sky_dome()
+    vertices, uv, _, triangles = meshes.sky_dome(math.radians(textures.SKY_LOWEST_DEG))
     return Mesh(vertices, uv, np.ones(len(vertices)), triangles, "sky", SKY_OBJECT, two_sided=True)
 
 
 def ground(world: ForestWorld) -> Mesh:
     """Return the ground plane; its texture coordinates start at the corner of the planted area."""
-    end = np.array([-FAR_GROUND_M, FAR_GROUND_M])
-    vertices, uv, _, triangles = meshes.terrain(end, end, np.zeros((2, 2)))
+    x = np.array([-world.run_in_m - FAR_GROUND_M, world.course_m + world.run_out_m + FAR_GROUND_M])
+    y = np.array([-1.0, 1.0]) * (world.half_width_m + FAR_GROUND_M)
+    vertices, uv, _, triangles = meshes.terrain(x, y, np.zeros((2, 2)))
     uv = uv + np.array([world.run_in_m, world.half_width_m])
     return Mesh(vertices, uv, np.ones(len(vertices)), triangles, "ground", GROUND_OBJECT)
 

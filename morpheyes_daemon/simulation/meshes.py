@@ -96,8 +96,22 @@ def blob(rng: np.random.Generator, centre: Array, radii: Array, subdivisions: in
     pushed = unit * (1.0 - roughness * rng.random((len(unit), 1)))
     normals = unit / radii
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    uv = np.column_stack([unit[:, 0] * 0.8 + unit[:, 2], unit[:, 1] * 0.8 - 0.6 * unit[:, 2]]) * float(np.mean(radii))
-    return centre + pushed * radii, uv + rng.random(2), normals, triangles
+    return _mapped_flat(rng, centre + pushed * radii, normals, triangles)
+
+
+def _mapped_flat(rng: np.random.Generator, vertices: Array, normals: Array, triangles: Triangles) -> Surface:
+    """Give every triangle texture of its own, undistorted and turned at random, as leaves have no grain."""
+    corners = vertices[triangles]
+    along, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    x = np.einsum("ij,ij->i", along, other) / length
+    y = np.linalg.norm(np.cross(along, other), axis=1) / length
+    angle, zero = rng.uniform(0, 2 * math.pi, len(triangles)), np.zeros(len(triangles))
+    c, s = np.cos(angle), np.sin(angle)
+    u = np.stack([zero, length * c, x * c - y * s], axis=1) + rng.random((len(triangles), 1))
+    v = np.stack([zero, length * s, x * s + y * c], axis=1) + rng.random((len(triangles), 1))
+    loose = np.arange(triangles.size, dtype=np.int32).reshape(-1, 3)
+    return corners.reshape(-1, 3), np.column_stack([u.ravel(), v.ravel()]), normals[triangles.ravel()], loose
 
 
 def leaf_cards(rng: np.random.Generator, centre: Array, radii: Array, count: int, size_m: float) -> Surface:
@@ -124,21 +138,18 @@ def cone_tier(rng: np.random.Generator, base: Array, height_m: float, radius_m: 
     droop = height_m * np.where(np.arange(2 * points) % 2 == 0, 0.0, 0.22)
     rim = base + np.column_stack([reach * np.cos(angle), reach * np.sin(angle), -droop])
     tip = base + np.array([0.0, 0.0, -height_m])
-    vertices = np.concatenate([rim, np.repeat(tip[None], 2 * points, axis=0)])
-    along = np.arange(2 * points) * (2.0 * radius_m * math.pi / (2 * points))
-    uv = np.concatenate([np.column_stack([along, np.zeros(2 * points)]),
-                         np.column_stack([along, np.full(2 * points, math.hypot(height_m, radius_m))])])
     outwards = np.column_stack([np.cos(angle), np.sin(angle), np.full(2 * points, -0.6)])
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
     i = np.arange(2 * points, dtype=np.int32)
-    triangles = np.column_stack([(i + 1) % (2 * points), i, i + 2 * points]).astype(np.int32)
-    return vertices, uv, np.concatenate([outwards, outwards]), triangles
+    triangles = np.column_stack([np.roll(i, -1), i, i + 2 * points]).astype(np.int32)
+    vertices = np.concatenate([rim, np.repeat(tip[None], 2 * points, axis=0)])
+    return _mapped_flat(rng, vertices, np.concatenate([outwards, outwards]), triangles)
 
 
-def sky_dome(rings: int = 12, segments: int = 24, radius_m: float = 1e5) -> Surface:
-    """Return a sphere seen from inside; u is azimuth / 2 pi, v is (90 deg - elevation) / 180 deg."""
+def sky_dome(lowest_rad: float, rings: int = 12, segments: int = 24, radius_m: float = 1e5) -> Surface:
+    """Return a sphere seen from inside, from the zenith (v = 0) down to `lowest_rad` (v = 1); u is azimuth / 2 pi."""
     v, u = np.meshgrid(np.linspace(0, 1, rings + 1), np.linspace(0, 1, segments + 1), indexing="ij")
-    elevation, azimuth = (0.5 - v) * math.pi, u * 2 * math.pi
+    elevation, azimuth = math.pi / 2 + v * (lowest_rad - math.pi / 2), u * 2 * math.pi
     level = np.cos(elevation)
     unit = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), -np.sin(elevation)], axis=-1)
     unit[:, -1] = unit[:, 0]

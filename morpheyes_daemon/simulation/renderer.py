@@ -80,9 +80,9 @@ class _Workspace:
     """Scratch memory of one renderer: set-up records, transformed vertices, and a buffer per image size."""
 
     def __init__(self, triangles: int, vertices: int) -> None:
-        self.records = np.empty((triangles, PLANES))
-        self.parts = np.empty(triangles, np.int32)
-        self.groups = np.empty(triangles, np.int32)
+        self.records = np.empty((1 + triangles, PLANES))
+        self.parts = np.empty(1 + triangles, np.int32)
+        self.groups = np.full(1 + triangles, -1, np.int32)
         self.transformed = np.empty((vertices, 3))
         self.polygon = np.empty((4, 2))
         self.sample_groups = np.empty(len(SAMPLES), np.int64)
@@ -128,7 +128,7 @@ class Renderer:
     def sibling(self) -> Renderer:
         """Return a renderer of the same scene with buffers of its own, for another thread."""
         other = copy.copy(self)
-        other._work = _Workspace(len(self._work.records), len(self._work.transformed))
+        other._work = _Workspace(len(self._work.records) - 1, len(self._work.transformed))
         return other
 
     def _material_rows(self, m: Material) -> tuple[tuple[int, ...], tuple[float, ...]]:
@@ -149,32 +149,39 @@ class Renderer:
         `eye_ned` (3,) is what drawing ranges are measured from; pass the same for both eyes of a pair.
         """
         shape = (pinhole.height, pinhole.width)
-        work = self._work
-        buffer, farthest = work.cleared(shape)
-        intrinsics = (pinhole.f_px, pinhole.cx_px, pinhole.cy_px)
         eye = T_ned_cam[:3, 3] if eye_ned is None else eye_ned
-        count = 0
-        for batch, T_ned_batch in zip(self._batches, self._frames(T_ned_cam, t_s), strict=True):
+        buffer = self._visible(T_ned_cam, pinhole, self._frames(T_ned_cam, t_s), eye)
+        shape = (pinhole.height, pinhole.width)
+        rendered = Rendered(
+            np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.full(shape, SKY_OBJECT, np.int32)
+        )
+        work, atlas = self._work, self._atlas
+        shade_image(
+            buffer, SAMPLES, work.sample_groups, work.records, work.parts, work.groups, self._looks,
+            self._part_materials, self._part_objects, self._materials, self._ratios, atlas.texels, atlas.levels,
+            self._light, rendered.radiance, rendered.depth_m, rendered.objects,
+        )  # fmt: skip
+        return rendered
+
+    def _visible(self, T_ned_cam: Array, pinhole: Pinhole, frames: list[Array], eye: Array) -> NDArray[np.uint64]:
+        """Rasterise all batches and return the visibility buffer."""
+        work, size = self._work, (pinhole.width, pinhole.height)
+        buffer, farthest = work.cleared((pinhole.height, pinhole.width))
+        intrinsics = (pinhole.f_px, pinhole.cx_px, pinhole.cy_px)
+        count = 1  # record 0 stands for nothing
+        for batch, T_ned_batch in zip(self._batches, frames, strict=True):
             if batch is None:
                 continue
             T_cam_batch = inverse(T_ned_cam) @ T_ned_batch
             R, t = T_cam_batch[:3, :3].copy(), T_cam_batch[:3, 3].copy()
             eye_batch = T_ned_batch[:3, :3].T @ (eye - T_ned_batch[:3, 3])
-            order = visible_parts(batch.bounds, R, t, eye_batch, intrinsics, (pinhole.width, pinhole.height))
+            order = visible_parts(batch.bounds, R, t, eye_batch, intrinsics, size)
             count = rasterise(
                 order, batch.vertices, batch.attributes, batch.triangles, batch.ranges, batch.flags, batch.first_part,
                 R, t, intrinsics, SAMPLES, buffer, farthest, work.transformed, work.polygon,
                 work.records, work.parts, work.groups, count,
             )  # fmt: skip
-        rendered = Rendered(
-            np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.full(shape, SKY_OBJECT, np.int32)
-        )
-        shade_image(
-            buffer, SAMPLES, work.sample_groups, work.records, work.parts, work.groups, self._looks,
-            self._part_materials, self._part_objects, self._materials, self._ratios,
-            self._atlas.texels, self._atlas.levels, self._light, rendered.radiance, rendered.depth_m, rendered.objects,
-        )  # fmt: skip
-        return rendered
+        return buffer
 
     def _frames(self, T_ned_cam: Array, t_s: float) -> list[Array]:
         """Where each batch is: moving objects, what stands, and the sky around the eye; the nearest things first."""

@@ -64,8 +64,8 @@ class Light:
     towards_sun: tuple[float, float, float] = (-0.45, -0.55, -0.70)
     sun: Bgr = (1.9, 2.3, 2.6)
     sky: Bgr = (0.62, 0.55, 0.50)
-    haze: Bgr = (0.62, 0.58, 0.50)
-    haze_range_m: float = 110.0
+    haze: Bgr = (0.46, 0.50, 0.43)
+    haze_range_m: float = 90.0
 
     @property
     def direction(self) -> Array:

@@ -160,7 +160,7 @@ def _gather(groups: Any, first: int, samples: Any) -> tuple[int, float, float]:
 
 @inlined
 def _is_uniform(buffer: Any, row: int, column: int, record_groups: Any, groups: Any) -> bool:
-    """Tell whether all samples of a pixel see the same; if not, note the group of each, -1 for nothing."""
+    """Tell whether all samples of a pixel see the same; if not, note the group of each."""
     x = np.uint64(column)
     difference = np.uint64(0)
     for s in range(1, buffer.shape[0]):
@@ -170,8 +170,7 @@ def _is_uniform(buffer: Any, row: int, column: int, record_groups: Any, groups: 
         return True
     uniform = True
     for s in range(buffer.shape[0]):
-        key = buffer[s, row, x]
-        groups[s] = record_groups[key & RECORD] if key else -1
+        groups[s] = record_groups[buffer[s, row, x] & RECORD]
         uniform = uniform and groups[s] == groups[0]
     return uniform
 
@@ -219,10 +218,9 @@ def shade_image(
                 if not uniform:
                     n, dx, dy = _gather(groups, s, samples)
                     x, y = column + dx / n, row + dy / n
-                key = buffer[s, row, column]
+                i = np.int64(buffer[s, row, np.uint64(column)] & RECORD)
                 b, g, r = light[2, 0], light[2, 1], light[2, 2]
-                if key:
-                    i = np.int64(key & RECORD)
+                if i > 0:
                     part = record_parts[i]
                     m = part_materials[part]
                     if s == 0 and materials[m, 4] < 2:

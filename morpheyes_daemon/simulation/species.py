@@ -20,7 +20,7 @@ from morpheyes_daemon.transforms import Array
 CONIFERS, BROADLEAVES = 6, 10
 """How many different ones there are of each."""
 
-ASPECT = 5.0
+ASPECT = 8.0
 """Height over crown width that the unit shapes are made for, so that leaves come out about as wide as high."""
 
 
@@ -71,7 +71,7 @@ def broadleaf(number: int) -> Species:
         up = rng.uniform(low + 0.1, 1.0)
         angle, out = 2 * math.pi * (k / 6 + 0.1 * rng.random()), (rng.uniform(0.35, 0.9) if k else 0.0)
         width = rng.uniform(0.6, 0.9)
-        half = min(0.6 * width / ASPECT, up - low)
+        half = min(0.75 * width / ASPECT, up - low)
         crowns.append((out * math.cos(angle), out * math.sin(angle), up, width, width, half))
     made = np.array(crowns)
     # meshes are made in ned axes at ASPECT widths of height

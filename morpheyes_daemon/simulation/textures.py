@@ -46,7 +46,8 @@ class Texture:
 class Atlas:
     """All textures with their mip levels in one array as the kernels want them.
 
-    texels (n,) uint64 hold blue, green, red and the fourth channel in 16-bit lanes, blue lowest; levels (textures, levels) say where each mip level starts.
+    texels (n,) uint64 hold blue, green, red and the fourth channel in 16-bit lanes, blue lowest; levels
+    (textures, levels) say where each mip level starts.
     """
 
     names: tuple[str, ...]
@@ -211,8 +212,11 @@ def dapple(seed: int, size: int = 256) -> Texture:
     return finished(tone, sun)
 
 
+SKY_LOWEST_DEG = -10.0
+"""Elevation at the lower edge of the sky's texture."""
+
 SKY_STOPS = [
-    (-5.0, (196, 206, 208)), (2.0, (205, 216, 222)), (12.0, (172, 202, 230)),
+    (-10.0, (150, 160, 140)), (2.0, (196, 208, 210)), (12.0, (172, 202, 230)),
     (40.0, (112, 165, 216)), (90.0, (74, 128, 196)),
 ]  # fmt: skip
 """Colour of the clear sky over elevation in degrees."""
@@ -220,19 +224,23 @@ SKY_STOPS = [
 
 @cache
 def sky(seed: int, size: int = 1024) -> Texture:
-    """A panorama: u the azimuth, v from the zenith (0) over the horizon (0.5) down; clouds and far woods."""
+    """Half a panorama (u: 180 degrees of azimuth), v from the zenith (0) to below the horizon: clouds, far woods."""
     rng = np.random.default_rng([seed, 5])
-    elevation = (0.5 - (np.arange(size) + 0.5) / size)[:, None] * 180.0
-    blue = coloured(
-        np.broadcast_to(elevation, (size, size)),
-        SKY_STOPS,
-    )
+    elevation = (90.0 - (np.arange(size) + 0.5) / size * (90.0 - SKY_LOWEST_DEG))[:, None]
+    blue = coloured(np.broadcast_to(elevation, (size, size)), SKY_STOPS)
     cloud = np.clip(0.55 * noise(rng, size, (0.6, 2.2), 1.5) + 0.05, 0, 1)[..., None]
     bgr = blue * (1 - 0.8 * cloud) + 0.8 * cloud * np.array([248, 244, 240])
-    crowns = 3.0 + 1.1 * noise(rng, size, slope=1.0)[:1]
-    woods = coloured(
-        noise(rng, size, slope=0.9),
-        [(-2, (106, 132, 116)), (0, (132, 156, 134)), (2, (158, 178, 150))],
-    )
-    bgr = np.where((elevation < crowns)[..., None], woods, bgr)
+    for distance, height in ((0.9, 8.5), (0.55, 7.0), (0.25, 5.2)):
+        bgr = _wood(rng, bgr, elevation, height, distance)
     return finished(bgr)
+
+
+def _wood(rng: np.random.Generator, bgr: Field, elevation: Field, height_deg: float, distance: float) -> Field:
+    """Put a row of trees before a panorama; `distance` 0..1 turns them to haze."""
+    size = bgr.shape[0]
+    crowns = height_deg + 1.1 * noise(rng, size, slope=0.8)[:1]
+    grain = noise(rng, size, (1.0, 2.5), 0.8)
+    trees = coloured(grain, [(-2, (58, 84, 50)), (0, (92, 122, 76)), (2, (138, 160, 108))])
+    trees = trees * (1 - distance) + distance * np.array([168, 182, 172])
+    edge = np.clip((crowns - elevation) / 0.15, 0, 1)[..., None]
+    return np.asarray(bgr * (1 - edge) + trees * edge)
