@@ -18,26 +18,27 @@ def check(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Check configuration and mission files; every error names file, line, key, what was found and what is allowed."""
+    """Check configuration and mission files; errors name file, line, key, what was found and what is allowed."""
     from morpheyes_daemon.errors import ConfigError
     from morpheyes_daemon.shipped import find_mission, load_config, load_mission, mission_names, shipped
 
     if not files:
         own = Path("config.yaml")
         files = [own if own.is_file() else shipped("config.yaml"), *(find_mission(name) for name in mission_names())]
-    rows = []
+    errors: dict[str, list[str]] = {}
     for file in files:
         try:
             load_mission(str(file)) if _is_mission(file) else load_config(file)
-            rows.append({"file": str(file), "ok": True, "errors": []})
+            errors[str(file)] = []
         except ConfigError as error:
-            rows.append({"file": str(file), "ok": False, "errors": str(error).splitlines()})
+            errors[str(file)] = str(error).splitlines()
     if as_json:
+        rows = [{"file": name, "ok": not found, "errors": found} for name, found in errors.items()]
         typer.echo(json.dumps(rows, indent=2))
     else:
-        for row in rows:
-            typer.echo("\n".join(row["errors"]) if row["errors"] else f"{row['file']}: good", err=bool(row["errors"]))
-    if not all(row["ok"] for row in rows):
+        for name, found in errors.items():
+            typer.echo("\n".join(found) or f"{name}: good", err=bool(found))
+    if any(errors.values()):
         raise typer.Exit(2)
 
 

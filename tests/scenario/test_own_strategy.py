@@ -1,0 +1,52 @@
+"""The example of docs/strategies.md works as it stands there: found by entry point, flown, stopped before a trunk."""
+
+import re
+import types
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+import yaml
+
+from morpheyes_daemon.experiments.flight import Watchers, fly
+from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.messages import MissionCommand
+from morpheyes_daemon.strategies import registry
+
+DOC = Path(__file__).parents[2] / "docs" / "strategies.md"
+
+
+def block(language: str) -> str:
+    found = re.search(rf"```{language}\n(.*?)```", DOC.read_text(encoding="utf-8"), re.DOTALL)
+    assert found
+    return found[1]
+
+
+def test_the_documented_strategy_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = types.ModuleType("documented_ahead")
+    exec(compile(block("python"), str(DOC), "exec"), module.__dict__)
+    monkeypatch.setitem(__import__("sys").modules, "documented_ahead", module)
+    point = EntryPoint("ahead", "documented_ahead:Ahead", "morpheyes.strategies")
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point])
+    (tmp_path / "ahead.yaml").write_text(block("yaml"), encoding="utf-8")
+    world = {"kind": "forest", "course_m": 10, "half_width_m": 12, "run_in_m": 6, "trees_per_ha": 900}
+    (tmp_path / "grove.yaml").write_text(yaml.safe_dump({"world": world}), encoding="utf-8")
+    plan = make_plan(
+        str(tmp_path / "ahead.yaml"),
+        world=str(tmp_path / "grove.yaml"),
+        size="160x120",
+        calibration="exact",
+        limit_s=40,
+    )
+    commands: list[MissionCommand] = []
+    summary = fly(plan, Watchers(attach=[lambda daemon, stage: daemon.topics.command.tap(commands.append)]))
+    assert summary.outcome != "collided"
+    assert max(command.v_ned_m_s[0] for command in commands) == pytest.approx(1.5, abs=0.05)
+    assert commands[-1].z_close_m < 16.0
+
+
+def test_a_strategy_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    point = EntryPoint("odd", "pathlib:Path", "morpheyes.strategies")
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point])
+    with pytest.raises(registry.ConfigError, match="not a subclass"):
+        registry.find_strategy("odd")
