@@ -15,10 +15,10 @@ from enum import StrEnum
 
 import numpy as np
 
-from morpheyes_daemon.calibration.ego_motion import EyeMotion
+from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates
 from morpheyes_daemon.calibration.yaw_watch import Look, Uncertain, YawWatch
 from morpheyes_daemon.messages import DepthMap, Image
-from morpheyes_daemon.stereo.epipolar import RowFit, RowWatch, row_offsets, row_rates
+from morpheyes_daemon.stereo.epipolar import RowFit, RowWatch, row_offsets
 from morpheyes_daemon.stereo.rectify import rectifying_rotation
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
@@ -120,8 +120,8 @@ class DriftMonitor:
         if moving or offsets.count < self.limits.points:
             self._agreeing = 0
             return self._report(offsets.median_px, offsets.count, self._fit, ())
-        rates = row_rates(offsets, depth.pinhole, depth.baseline_m, motion.v_rect_m_s, motion.w_rect_rad_s)
-        self._fit = self._rows.add(offsets, depth.pinhole, rates)
+        rates = right_eye_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, motion)
+        self._fit = self._rows.add(offsets, depth.pinhole, rates[:, 1])
         f_px = depth.pinhole.f_px
         findings = self._judge_rows(offsets.median_px, f_px, nominal_m)
         if not findings and offsets.median_px < 2 * self.limits.rows_px:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.messages import VehicleState
+from morpheyes_daemon.messages import Pinhole, VehicleState
 from morpheyes_daemon.transforms import Array, R_from_rpy, pose
 
 
@@ -33,3 +33,19 @@ def eye_motion(vehicle: VehicleState, T_frd_rig: Array, T_rig_rect: Array) -> Ey
     R_rect_frd = T_frd_rect[:3, :3].T
     T_ned_rect = pose(R_ned_frd, np.array(vehicle.p_ned_m)) @ T_frd_rect
     return EyeMotion(T_ned_rect, R_rect_frd @ v_frd, R_rect_frd @ w_frd)
+
+
+def right_eye_rates(uv: Array, d_px: Array, pinhole: Pinhole, baseline_m: float, motion: EyeMotion) -> Array:
+    """Return how fast (n, 2) static points move in the right rectified image, px/s; uv (n, 2) are left pixels.
+
+    dP/dt = -v - w x P for the right eye, which a turning bar carries along: v is taken there. This is what a time
+    offset between the eyes multiplies.
+    """
+    x = (uv[:, 0] - d_px - pinhole.cx_px) / pinhole.f_px
+    y = (uv[:, 1] - pinhole.cy_px) / pinhole.f_px
+    per_m = np.maximum(d_px, 0.0) / (baseline_m * pinhole.f_px)
+    wx, wy, wz = motion.w_rect_rad_s
+    vx, vy, vz = motion.v_rect_m_s + np.cross(motion.w_rect_rad_s, [baseline_m, 0.0, 0.0])
+    columns = (x * vz - vx) * per_m - wy * (1.0 + x * x) + wx * x * y + wz * y
+    rows = (y * vz - vy) * per_m + wx * (1.0 + y * y) - wy * x * y - wz * x
+    return np.asarray(pinhole.f_px * np.stack([columns, rows], axis=-1))

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.messages import Image
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 _SIDE_BY_SIDE_ASPECT = 1.9
@@ -62,6 +64,20 @@ def read_folder(root: Path) -> tuple[list[BaselineFolder], list[str]]:
             "100mm, named left01.png, right01.png and so on."
         )
     return usable, problems
+
+
+def read_pair(files: PairFiles) -> tuple[Image, Image]:
+    """Return both pictures (H, W, 3) of a pair; raises InputError naming the file that cannot be read."""
+    pictures = []
+    for path in (files.left, files.right):
+        image = None if path is None else cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if image is None:
+            raise InputError(f"{path}: is not a readable picture; copy it again or remove it.")
+        pictures.append(np.asarray(image, dtype=np.uint8))
+    if not files.side_by_side:
+        return pictures[0], pictures[1]
+    middle = pictures[0].shape[1] // 2
+    return pictures[0][:, :middle].copy(), pictures[0][:, middle : 2 * middle].copy()
 
 
 def nominal_from_name(path: Path) -> float | None:

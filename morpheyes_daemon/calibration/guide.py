@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.boards import Board, aligned, find_corners, spacing_px
 from morpheyes_daemon.calibration.coverage import CELLS, cell_of, count_cells, empty_corners
@@ -61,7 +62,7 @@ class CaptureGuide:
         """Enough pairs are kept."""
         return self.kept >= self.wanted
 
-    def covered(self, eye: int) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
+    def covered(self, eye: int) -> NDArray[np.int64]:
         """Return corners kept per cell (rows, columns) of the left (0) or right (1) image."""
         pixels = [(one.left, one.right)[eye] for one in self._kept]
         return count_cells(np.array(pixels), self.size) if pixels else np.zeros(CELLS[::-1], dtype=np.int64)
@@ -130,6 +131,6 @@ def _alike(one: _Seen, other: _Seen) -> bool:
     return bool(near and moved < 3 * one.square_px and np.all(np.abs(one.tilt - other.tilt) < _NEW_TILT))
 
 
-def _fresh_cells(pixels: Array, counts: np.ndarray[tuple[int, int], np.dtype[np.int64]], size: tuple[int, int]) -> int:
+def _fresh_cells(pixels: Array, counts: NDArray[np.int64], size: tuple[int, int]) -> int:
     column, row = cell_of(pixels[np.isfinite(pixels[:, 0])], size)
     return len({(int(r), int(c)) for r, c in zip(row, column, strict=True) if counts[r, c] == 0})

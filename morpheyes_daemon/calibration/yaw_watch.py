@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.calibration.ego_motion import EyeMotion
+from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates
 from morpheyes_daemon.messages import FloatMap, Image, Pinhole
 from morpheyes_daemon.transforms import Array, inverse
 
@@ -183,13 +183,6 @@ def textured_points(left: Image, disparity_px: FloatMap) -> Array:
     return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
 
 
-def column_rates(x: Array, depth_m: Array, motion: EyeMotion) -> Array:
-    """Return how fast (n,) the columns of static points at x (n, 2) = X/Z, Y/Z move, 1/s: dP/dt = -v - w x P."""
-    (vx, _, vz), (wx, wy, wz) = motion.v_rect_m_s, motion.w_rect_rad_s
-    turning = -wy * (1.0 + x[:, 0] ** 2) + wx * x[:, 0] * x[:, 1] + wz * x[:, 1]
-    return np.asarray(turning - (vx - x[:, 0] * vz) / depth_m)
-
-
 def _disparities(look: Look, uv: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the disparity (n,) of left points by following them into the right eye, lateness taken out."""
     column = np.clip(np.round(uv[:, 0]), 0, look.left.shape[1] - 1).astype(np.intp)
@@ -200,9 +193,8 @@ def _disparities(look: Look, uv: Array) -> tuple[Array, NDArray[np.bool_]]:
     found, followed = _follow(look.left, look.right, uv, guess, levels=0)
     d = uv[:, 0] - found[:, 0]
     good = known & followed & (np.abs(found[:, 1] - uv[:, 1]) < _ROW_LIMIT_PX) & (np.abs(d - start) < 2.0)
-    x = (uv - [look.pinhole.cx_px, look.pinhole.cy_px]) / look.pinhole.f_px
-    depth = look.baseline_m * look.pinhole.f_px / np.maximum(d, 0.5)
-    return d + look.late_s * look.pinhole.f_px * column_rates(x, depth, look.motion), good
+    rates = right_eye_rates(uv, np.maximum(d, 0.5), look.pinhole, look.baseline_m, look.motion)
+    return d + look.late_s * rates[:, 0], good
 
 
 def _carried(p_1: Array, first: Look, second: Look) -> Array:

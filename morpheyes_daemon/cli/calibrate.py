@@ -10,18 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from morpheyes_daemon.cli.calibrate_live import (
+    BoardOption,
+    JsonOption,
+    MarkerOption,
+    SquareOption,
+    capture,
+    check,
+    repeatability,
+)
+
 if TYPE_CHECKING:
     from morpheyes_daemon.calibration.boards import Board
     from morpheyes_daemon.calibration.result import Solved
 
 app = typer.Typer(help="Calibrate the stereo rig and check it.", no_args_is_help=True, rich_markup_mode=None)
-
-BoardOption = Annotated[
-    str | None, typer.Option("--board", help="Inner corners such as 9x6, or squares such as charuco:10x7:5X5_1000.")
-]
-SquareOption = Annotated[float | None, typer.Option("--square-mm", help="Side of one square, measured.")]
-MarkerOption = Annotated[float | None, typer.Option("--marker-mm", help="Side of one marker of a ChArUco board.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
 
 
 @app.command()
@@ -41,7 +44,7 @@ def solve(
     from morpheyes_daemon.clock import wall_time_s
 
     known = read_board_file(folder) if folder.is_dir() else {}
-    chosen = _board(known, board, square_mm, marker_mm, ask=not as_json and sys.stdin.isatty())
+    chosen = choose_board(known, board, square_mm, marker_mm, ask=not as_json and sys.stdin.isatty())
     today = datetime.datetime.fromtimestamp(wall_time_s(), datetime.UTC).date()
     header = {"rig": str(known.get("rig", folder.resolve().name)), "date": today.isoformat()}
     with progress_line() as progress:
@@ -88,9 +91,11 @@ def render(
     """Render boards before the simulator's camera, as folders that `solve` takes."""
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.experiments.rendered_boards import DEFAULT_BOARD, render_folder
+    from morpheyes_daemon.simulation.rig_twin import RANGE_M
 
-    chosen = _board({"board": DEFAULT_BOARD.label, "square_mm": 25.0}, board, square_mm, marker_mm, checked=False)
-    nominal_m = _baselines_m(baselines_mm)
+    usual = {"board": DEFAULT_BOARD.label, "square_mm": 25.0}
+    chosen = choose_board(usual, board, square_mm, marker_mm, checked=False)
+    nominal_m = choose_baselines_m(baselines_mm, RANGE_M)
     with progress_line() as progress:
         render_folder(out, seed, nominal_m, views, chosen, _size(size), progress)
     typer.echo(f"{len(nominal_m)} baselines, {views} pairs each: {out}; next: morpheyes calibrate solve {out}")
@@ -117,7 +122,7 @@ def evaluate(
     if separate is not None:
         from morpheyes_daemon.calibration.folder_solve import read_board_file
 
-        chosen = _board(read_board_file(separate), None, None, None)
+        chosen = choose_board(read_board_file(separate), None, None, None)
         with progress_line() as progress:
             figures["at_calibrated_baselines"] = compare_separate(separate, chosen, rig, twin, progress)
     if as_json:
@@ -144,7 +149,7 @@ def evaluate(
         typer.echo(f"{name}: " + ", ".join(f"{key} {value}" for key, value in row.items()))
 
 
-def _board(
+def choose_board(
     known: Any,
     board: str | None,
     square_mm: float | None,
@@ -153,7 +158,6 @@ def _board(
     checked: bool = True,
 ) -> Board:
     """Return the board from the options or else from what the folder says; raises UsageError when they disagree."""
-    from morpheyes_daemon.calibration.boards import parse_board
     from morpheyes_daemon.errors import UsageError
 
     written = known.get("square_mm")
@@ -169,20 +173,21 @@ def _board(
     return parse_board(label, side_mm / 1e3, None if marker is None else float(marker) / 1e3)
 
 
-def _baselines_m(text: str) -> list[float]:
+def choose_baselines_m(text: str, range_m: tuple[float, float]) -> list[float]:
+    """Return the nominal baselines of `--baselines`: a number of them, or lengths in mm; raises UsageError."""
     import numpy as np
 
     from morpheyes_daemon.errors import UsageError
-    from morpheyes_daemon.simulation.rig_twin import RANGE_M
 
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         raise UsageError(f"--baselines {text!r} is not understood; give 10, or lengths such as 100,200.") from None
     if len(numbers) == 1 and 2 <= numbers[0] <= 50 and numbers[0].is_integer():
-        return [round(float(b), 4) for b in np.linspace(*RANGE_M, int(numbers[0]))]
-    if not all(RANGE_M[0] * 1e3 <= number <= RANGE_M[1] * 1e3 for number in numbers):
-        raise UsageError("--baselines must lie within the rail's 100 to 300 mm.")
+        return [round(float(b), 4) for b in np.linspace(*range_m, int(numbers[0]))]
+    low_mm, high_mm = (round(length * 1e3, 4) for length in range_m)
+    if not all(low_mm <= number <= high_mm for number in numbers):
+        raise UsageError(f"--baselines must lie within the rail's {low_mm:g} to {high_mm:g} mm.")
     if len({round(number, 1) for number in numbers}) < len(numbers):
         raise UsageError("--baselines names a length twice.")
     return [round(number / 1e3, 4) for number in sorted(numbers)]
@@ -227,3 +232,8 @@ def _print_table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> No
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
     for row in [header, *rows]:
         typer.echo("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)))
+
+
+app.command()(capture)
+app.command()(check)
+app.command()(repeatability)

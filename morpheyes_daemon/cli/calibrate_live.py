@@ -1,0 +1,221 @@
+"""The part of `morpheyes calibrate` that looks at a rig: capture, check, repeatability. Registered by `calibrate`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from morpheyes_daemon.calibration.checks import CheckResult, RigCheck
+    from morpheyes_daemon.config import VehicleConfig
+    from morpheyes_daemon.messages import Image
+    from morpheyes_daemon.workshop.capture import Scene
+
+BoardOption = Annotated[
+    str | None, typer.Option("--board", help="Inner corners such as 9x6, or squares such as charuco:10x7:5X5_1000.")
+]
+SquareOption = Annotated[float | None, typer.Option("--square-mm", help="Side of one square, measured.")]
+MarkerOption = Annotated[float | None, typer.Option("--marker-mm", help="Side of one marker of a ChArUco board.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="Vehicle configuration; default: config.yaml.")]
+
+
+def capture(
+    out: Annotated[Path, typer.Argument(help="Folder for the pictures; goes on where it stopped.")],
+    config: ConfigOption = None,
+    baselines_mm: Annotated[str, typer.Option("--baselines", help="How many, or lengths such as 100,200.")] = "10",
+    views: Annotated[int, typer.Option("--views", min=3, max=200, help="Pairs per baseline.")] = 12,
+    visits: Annotated[
+        int, typer.Option("--visits", min=0, max=100, help="For repeatability: so many visits with a standing board.")
+    ] = 0,
+    board: BoardOption = None,
+    square_mm: SquareOption = None,
+    marker_mm: MarkerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Lead through all baselines with the rig's own camera and servo, keeping pictures that tell more."""
+    import asyncio
+
+    from morpheyes_daemon.calibration.folder_solve import read_board_file
+    from morpheyes_daemon.cli.calibrate import choose_baselines_m, choose_board
+    from morpheyes_daemon.clock import running_clock
+    from morpheyes_daemon.devices.link import open_link
+    from morpheyes_daemon.shipped import load_config
+    from morpheyes_daemon.workshop.capture import capture_boards, capture_visits
+    from morpheyes_daemon.workshop.stand import RigStand
+
+    vehicle = load_config(config)
+    known = read_board_file(out) if out.is_dir() else {}
+    chosen = choose_board(known, board, square_mm, marker_mm, ask=not as_json and sys.stdin.isatty())
+    low_m, high_m = vehicle.baseline_range_m
+    nominal_m = [low_m] if low_m == high_m else choose_baselines_m(baselines_mm, (low_m, high_m))
+
+    async def session() -> dict[str, int]:
+        async with RigStand.of(vehicle, running_clock(), open_link) as stand:
+            if visits:
+                return await capture_visits(stand, out, chosen, nominal_m, visits, _show)
+            return await capture_boards(stand, out, chosen, nominal_m, views, _show)
+
+    counts = asyncio.run(session())
+    if as_json:
+        typer.echo(json.dumps({"folder": str(out), "pairs": counts}, indent=2))
+    else:
+        typer.echo(f"{sum(counts.values())} pairs are in {out}; next: morpheyes calibrate solve {out}")
+
+
+def check(
+    file: Annotated[Path, typer.Argument(help="Calibration file.")],
+    folder: Annotated[
+        Path | None, typer.Argument(help="Recorded pairs, in folders such as 100mm; none: the rig itself.")
+    ] = None,
+    config: ConfigOption = None,
+    frames: Annotated[int, typer.Option("--frames", min=1, max=1000, help="Pairs per baseline from the rig.")] = 10,
+    baseline_mm: Annotated[
+        float | None, typer.Option("--baseline-mm", help="Baseline of a recording whose folder names none.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check a calibration on any scene that holds still, without a board: rows at every baseline, and the yaw."""
+    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.stereo.rig import RigModel
+
+    rig = RigModel.load(file)
+    with progress_line() as progress:
+        if folder is not None:
+            result = _check_recorded(rig, folder, baseline_mm, progress)
+        else:
+            from morpheyes_daemon.shipped import load_config
+
+            result = _check_live(rig, load_config(config), frames, progress)
+    if as_json:
+        typer.echo(json.dumps(result.figures(), indent=2))
+    else:
+        _print_check(result)
+    if not result.passed:
+        raise typer.Exit(1)
+
+
+def repeatability(
+    file: Annotated[Path, typer.Argument(help="Calibration file.")],
+    folder: Annotated[Path, typer.Argument(help="One folder per target, one pair per visit (capture --visits 10).")],
+    out: Annotated[Path, typer.Option("--out", help="Picture to write.")] = Path("repeatability.png"),
+    board: BoardOption = None,
+    square_mm: SquareOption = None,
+    marker_mm: MarkerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show target against achieved baseline: mean and 10 sigma band over the visits, as in the paper's figure."""
+    from morpheyes_daemon.calibration.detection import observe
+    from morpheyes_daemon.calibration.folder import read_folder
+    from morpheyes_daemon.calibration.folder_solve import read_board_file
+    from morpheyes_daemon.calibration.repeatability import draw, figures, positions
+    from morpheyes_daemon.cli.calibrate import choose_board
+    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.stereo.rig import RigModel
+
+    rig = RigModel.load(file)
+    known = read_board_file(folder) if folder.is_dir() else {}
+    chosen = choose_board(known, board, square_mm, marker_mm, ask=not as_json and sys.stdin.isatty())
+    with progress_line() as progress:
+        folders, problems = read_folder(folder)
+        found = positions(rig, observe(folders, chosen, None, progress, problems), progress)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    draw(found).savefig(out, dpi=150)
+    shown = figures(found)
+    if as_json:
+        typer.echo(json.dumps({**shown, "picture": str(out)}, indent=2))
+        return
+    for row in shown["positions"]:
+        achieved = f"{row['mean_mm']:.2f} mm, sigma {row['sigma_mm']:.2f} mm"
+        typer.echo(f"{row['target_mm']:g} mm: {achieved}, {row['samples']} visits")
+    worst = f"{shown['largest_error_mm']:.2f} mm ({shown['largest_error_pct']:.2f} %)"
+    typer.echo(f"largest error {worst}; paper: 1.83 mm; drawn: {out}")
+
+
+def _check_recorded(rig: Any, folder: Path, baseline_mm: float | None, progress: Any) -> CheckResult:
+    from morpheyes_daemon.calibration.checks import RigCheck
+    from morpheyes_daemon.errors import UsageError
+
+    check: RigCheck | None = None
+    pairs = list(_recorded_pairs(folder))
+    for done, (nominal_m, left, right) in enumerate(pairs, start=1):
+        at_m = nominal_m if baseline_mm is None else baseline_mm / 1e3
+        if at_m is None:
+            at_m = rig.range_m[0]
+            if rig.range_m[0] != rig.range_m[1]:
+                raise UsageError(f"{folder}: names no baseline; give --baseline-mm, or put the pairs in 150mm.")
+        check = check or RigCheck(rig, (left.shape[1], left.shape[0]))
+        check.add(at_m, left, right)
+        progress("comparing rows", done, len(pairs))
+    if check is None:
+        raise UsageError(f"{folder}: holds no readable pairs.")
+    return check.result()
+
+
+def _recorded_pairs(folder: Path) -> Iterator[tuple[float | None, Image, Image]]:
+    from morpheyes_daemon.calibration.folder import read_folder, read_pair
+
+    folders, _ = read_folder(folder)
+    for one in folders:
+        for files in one.pairs:
+            if files.left is not None and files.right is not None:
+                left, right = read_pair(files)
+                yield one.nominal_m, left, right
+
+
+def _check_live(rig: Any, config: VehicleConfig, frames: int, progress: Any) -> CheckResult:
+    import asyncio
+
+    from morpheyes_daemon.calibration.checks import RigCheck
+    from morpheyes_daemon.clock import running_clock
+    from morpheyes_daemon.devices.link import open_link
+    from morpheyes_daemon.workshop.stand import RigStand
+
+    async def session() -> RigCheck:
+        check = RigCheck(rig, (config.camera.width_px, config.camera.height_px))
+        async with RigStand.of(config, running_clock(), open_link) as stand:
+            low_m, high_m = rig.range_m
+            places = [low_m] if low_m == high_m else [low_m, (low_m + high_m) / 2, high_m]
+            for index, place_m in enumerate(places):
+                await stand.place(place_m)
+                for number in range(frames):
+                    pair = await stand.pair()
+                    check.add(place_m, pair.left, pair.right)
+                    progress("comparing rows", index * frames + number + 1, len(places) * frames)
+        return check
+
+    return asyncio.run(session()).result()
+
+
+def _print_check(result: CheckResult) -> None:
+    for one in result.baselines:
+        row = one.figures()
+        rows = "no texture" if row["epipolar_median_px"] is None else f"rows {row['epipolar_median_px']:.3f} px"
+        turn = ""
+        if row["pitch_deg"] is not None:
+            turn = f", pitch {row['pitch_deg']:+.3f} deg, roll {row['roll_deg']:+.3f} deg"
+        typer.echo(f"{row['nominal_mm']:g} mm, {row['pairs']} pairs: {rows}{turn}")
+    if result.bias_px is not None:
+        typer.echo(f"disparity bias (yaw): {result.bias_px:+.3f} ± {result.bias_sigma_px:.3f} px")
+    for finding in result.findings:
+        typer.echo(finding)
+    typer.echo(result.verdict)
+
+
+def _map(counts: Any) -> str:
+    """Coverage as text: rows one after the other, a dot where no corner was seen."""
+    return "/".join("".join(".:*#"[min(int(count), 3)] for count in row) for row in counts)
+
+
+def _show(scene: Scene) -> None:
+    """One line that is written over, with a small map of what both eyes have covered."""
+    guide = scene.guide
+    maps = "  ".join(_map(guide.covered(eye)) for eye in (0, 1))
+    line = f"{scene.nominal_m * 1e3:g} mm  {guide.kept}/{guide.wanted}  {scene.hint.text:44} {maps}"
+    sys.stderr.write(f"\r\x1b[K{line}" if sys.stderr.isatty() else (f"{line}\n" if scene.hint.kept else ""))
+    sys.stderr.flush()

@@ -1,0 +1,71 @@
+"""Camera and servo of a rig on the table: move the eyes, wait until they rest, take a pair.
+
+The eyes approach every baseline by shrinking, as in flight, so that the servo's play is always on the same side.
+"""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+from morpheyes_daemon.bus import EventLog
+from morpheyes_daemon.clock import MS, Clock
+from morpheyes_daemon.config import NoServoConfig, VehicleConfig
+from morpheyes_daemon.control.baseline import BaselineModel, FixedBaseline
+from morpheyes_daemon.control.baseline_planner import OVERSHOOT_M
+from morpheyes_daemon.devices.camera import Camera, build_camera
+from morpheyes_daemon.devices.link import LinkOpener
+from morpheyes_daemon.devices.servo import Servo, build_servo
+from morpheyes_daemon.messages import RawPair
+
+
+class RigStand:
+    """An open camera and servo; use it with `async with`."""
+
+    def __init__(self, camera: Camera, servo: Servo, config: VehicleConfig, clock: Clock) -> None:
+        self._camera, self._servo, self._clock = camera, servo, clock
+        self._range_m = config.baseline_range_m
+        self._model = _baseline_model(config)
+
+    @classmethod
+    def of(cls, config: VehicleConfig, clock: Clock, opener: LinkOpener) -> Self:
+        """Return the stand of the configured devices, not yet open."""
+        servo = build_servo(config.servo, opener, clock, EventLog())
+        return cls(build_camera(config.camera, clock), servo, config, clock)
+
+    async def __aenter__(self) -> Self:
+        await self._servo.open()
+        await self._camera.open()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._camera.close()
+        await self._servo.close()
+
+    @property
+    def range_m(self) -> tuple[float, float]:
+        """Smallest and largest baseline of the rig; equal for a fixed one."""
+        return self._range_m
+
+    async def place(self, nominal_m: float) -> None:
+        """Bring the eyes to a nominal baseline from above and wait until they rest there."""
+        if self._range_m[0] == self._range_m[1]:
+            return
+        above_m = min(nominal_m + OVERSHOOT_M, self._range_m[1])
+        for target_m in (above_m, nominal_m):
+            await self._servo.move(target_m)
+            self._model.command(target_m, self._clock.now_ns())
+            while self._model.at(self._clock.now_ns()).moving:
+                await self._clock.sleep_until_ns(self._clock.now_ns() + 20 * MS)
+
+    async def pair(self) -> RawPair:
+        """Wait for the next raw pair."""
+        return await self._camera.read()
+
+
+def _baseline_model(config: VehicleConfig) -> BaselineModel | FixedBaseline:
+    if isinstance(config.servo, NoServoConfig):
+        return FixedBaseline(config.baseline_range_m[0])
+    return BaselineModel(config.servo.motion)
