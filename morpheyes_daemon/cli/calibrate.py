@@ -158,6 +158,7 @@ def choose_board(
     checked: bool = True,
 ) -> Board:
     """Return the board from the options or else from what the folder says; raises UsageError when they disagree."""
+    from morpheyes_daemon.calibration.boards import parse_board
     from morpheyes_daemon.errors import UsageError
 
     written = known.get("square_mm")
