@@ -34,6 +34,9 @@ EXTRINSIC = ("T", "phi", "theta", "psi")
 NOMINAL: Mapping[str, float] = {"alpha": 1e-3, "k1": -0.1, "k2": 0.02, "k3": 1e-3, "k4": 1e-3, "k5": 5e-3}
 """What errors are percent of, since the paper does not say; table I does not depend on it."""
 
+GRID_POINTS = 65
+"""Points per side at which errors are looked at."""
+
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5")
 
 ERROR_PCT = 1.0
@@ -140,9 +143,13 @@ def _alone(lens: CameraIntrinsics, name: str, factor: float) -> CameraIntrinsics
 
 
 def _ideal_grid(lens: CameraIntrinsics) -> Array:
-    """Return where each pixel (H, W, 2) would look through the same lens without distortion: the paper's x."""
-    u, v = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
-    return np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy], axis=-1)
+    """Return where pixels (h, w, 2) would look through the same lens without distortion: the paper's x.
+
+    They lie on a grid over the whole image with its edges, dense enough for errors as smooth as these.
+    """
+    u = np.linspace(0, lens.width - 1, min(lens.width, GRID_POINTS))
+    v = np.linspace(0, lens.height - 1, min(lens.height, GRID_POINTS))
+    return np.stack(np.meshgrid((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy), axis=-1)
 
 
 def _rectified(pair: EyePair, R_cam1_cam0: Array, t_cam0_cam1: Array) -> tuple[Array, Array]:
