@@ -38,7 +38,7 @@ from morpheyes_daemon.service import build_parts, event_loop
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.supervisor.worker_process import ProcessWorker
 
-READY_LIMIT_S = 240.0
+READY_LIMIT_S = 600.0
 """World, textures and a first compilation of the renderer; a real GPS takes 42 s."""
 CLOSE_LIMIT_S = 150.0
 """A SITL is landed before the simulator ends."""

@@ -1,0 +1,73 @@
+"""The truth of a SITL from its SIM_STATE: local metres, interpolated, and honest about what it does not know."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from morpheyes_daemon.clock import MS, S
+from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.simulation.radio import Radio
+from morpheyes_daemon.simulation.sitl_vehicle import AHEAD_NS, SitlVehicle
+from tests.hand_clock import HandClock
+
+LAT, LON, ALT = -353632620, 1491652370, 584.0
+LATITUDE = math.radians(LAT / 1e7)
+PER_UNIT_M = 6_378_137.0 * math.pi / 180.0 / 1e7
+
+
+class Deaf:
+    def write(self, data: bytes) -> None:
+        """Nobody reads what is asked for."""
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.clock = HandClock()
+        self.vehicle = SitlVehicle(Deaf(), Radio(), self.clock)
+        self.sender = mavlink.MAVLink(None, 1, 1)
+
+    def say(self, north_m: float, east_m: float, up_m: float, yaw_rad: float = 0.0, v_m_s: float = 0.0) -> int:
+        """Let the SITL say where it is now, and return when."""
+        lat = LAT + round(north_m / PER_UNIT_M)
+        lon = LON + round(east_m / (PER_UNIT_M * math.cos(LATITUDE)))
+        message = mavlink.MAVLink_sim_state_message(
+            1, 0, 0, 0, 0.1, -0.2, yaw_rad, 0, 0, 0, 0, 0, 0,
+            lat / 1e7, lon / 1e7, ALT + up_m, 0, 0, v_m_s, 0, 0, lat, lon,
+        )  # fmt: skip
+        self.vehicle.on_bytes(message.pack(self.sender))
+        return self.clock.now_ns()
+
+
+def test_positions_are_metres_from_the_start_in_the_world() -> None:
+    bench = Bench()
+    bench.say(0.0, 0.0, 0.0)
+    bench.clock.t_ns += 10 * MS
+    t_ns = bench.say(12.0, -3.0, 1.5)
+    bench.vehicle.stand_at(2.0, 1.0)
+    truth = bench.vehicle.truth_at(t_ns)
+    # SIM_STATE counts in 1e-7 degrees: 11 mm
+    assert truth.p_ned_m == pytest.approx((14.0, -2.0, -1.5), abs=0.012)
+    assert (truth.roll_rad, truth.pitch_rad) == pytest.approx((0.1, -0.2))
+
+
+def test_between_two_poses_it_interpolates_across_south_too() -> None:
+    bench = Bench()
+    first_ns = bench.say(0.0, 0.0, 0.0, yaw_rad=math.pi - 0.1)
+    bench.clock.t_ns += 20 * MS
+    bench.say(1.0, 0.0, 0.0, yaw_rad=-math.pi + 0.1)
+    truth = bench.vehicle.truth_at(first_ns + 10 * MS)
+    assert truth.p_ned_m[0] == pytest.approx(0.5, abs=0.012)
+    assert abs(truth.yaw_rad) == pytest.approx(math.pi, abs=1e-6)
+
+
+def test_it_moves_on_for_a_while_and_then_says_that_it_does_not_know() -> None:
+    bench = Bench()
+    t_ns = bench.say(0.0, 0.0, 0.0, v_m_s=2.0)
+    assert bench.vehicle.truth_at(t_ns + S // 10).p_ned_m[0] == pytest.approx(0.2)
+    with pytest.raises(InputError, match="not known"):
+        bench.vehicle.truth_at(t_ns + AHEAD_NS + 1)
+    with pytest.raises(InputError, match="not known"):
+        bench.vehicle.truth_at(t_ns - 1)
