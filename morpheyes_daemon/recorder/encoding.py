@@ -199,6 +199,8 @@ def _typed_dataclass(plain: Mapping[str, Any], cls: type) -> Any:
     values = {f.name: _typed(plain[f.name], hints[f.name]) for f in fields(cls) if f.init and f.name in plain}
     for f in fields(cls):
         if f.init and f.name not in values and _has_no_default(f):
+            if f.name not in OMITTED.get(cls, ()):
+                raise KeyError(f"{f.name} is missing, another version wrote it")
             values[f.name] = None
     return cls(**values)
 

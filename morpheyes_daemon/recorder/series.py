@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages import Event, Intent, Perception
+from morpheyes_daemon.safety.guardian import NOT_RESUMED
 from morpheyes_daemon.safety.states import State
 
 Column = NDArray[np.float64]
 
-ONE_BRAKING_S = 1.0
-"""Gate and mission often brake for the same thing; within this time it counts once."""
 KEPT = ("perception", "vehicle", "command", "governed", "gate", "baseline")
 
 
@@ -108,14 +107,13 @@ class FlightSeries:
         return [(float(times[i]), end, words[i]) for i, end in zip(starts, ends, strict=False)]
 
     def braking(self) -> list[tuple[float, str]]:
-        """Return (second, reason) of each time the vehicle was made to stop, by the gate or by the mission."""
-        by_gate = self._beginnings("gate", lambda output: output.state == State.BRAKING)
-        by_mission = self._beginnings("command", lambda command: command.intent == Intent.STOP)
-        merged: list[tuple[float, str]] = []
-        for t, reason in sorted(by_gate + by_mission):
-            if not merged or t - merged[-1][0] > ONE_BRAKING_S:
-                merged.append((t, reason))
-        return merged
+        """Return (second, reason) of each time the gate took the sticks back, the mission's end aside."""
+        braked = self._beginnings("gate", lambda output: output.state == State.BRAKING)
+        return [(t, reason) for t, reason in braked if reason not in NOT_RESUMED]
+
+    def stops(self) -> list[tuple[float, str]]:
+        """Return (second, reason) of each time the mission itself stopped to look around."""
+        return self._beginnings("command", lambda command: command.intent == Intent.STOP)
 
     def _beginnings(self, topic: str, holds: Callable[[Any], bool]) -> list[tuple[float, str]]:
         rows = self._messages[topic]

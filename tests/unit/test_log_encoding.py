@@ -95,6 +95,13 @@ def test_nonsense_is_a_sentence() -> None:
         from_plain({"t_ns": "soon", "source": "x", "reason": "no_such_reason"}, Event)
 
 
+def test_a_message_of_another_version_is_refused_unless_the_new_field_has_a_default() -> None:
+    plain = to_plain(Event(7, "gate", Reason.LINK_LOST, "0.6 s"))
+    assert from_plain({k: v for k, v in plain.items() if k != "text"} | {"old": 1}, Event).text == ""
+    with pytest.raises(RecordingError, match="source is missing"):
+        from_plain({k: v for k, v in plain.items() if k != "source"}, Event)
+
+
 def test_schema_names_every_field_with_its_kind() -> None:
     properties = json.loads(dataclass_schema(GateOutput))["properties"]
     assert properties["pitch_us"] == {"type": "integer"}

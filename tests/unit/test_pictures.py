@@ -11,6 +11,7 @@ from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config import Footprint
 from morpheyes_daemon.messages import BaselineEstimate, VehicleState
+from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import DPI, LEFT_IN, RIGHT_IN, WIDTH_IN, draw_map
 from morpheyes_daemon.recorder.pictures.outline import Track, clearances, closest_passes
@@ -20,6 +21,8 @@ from morpheyes_daemon.recorder.pictures.topview import TREE, Pose, TopView
 from morpheyes_daemon.recorder.reader import read_flight
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.series import FlightSeries
+from morpheyes_daemon.safety.gate import GateOutput
+from morpheyes_daemon.safety.states import Action, State
 from morpheyes_daemon.stereo.colours import UNKNOWN_BGR, baseline_bgr, colour_depth
 from tests.hand_clock import HandClock
 from tests.synthetic_flight import SyntheticFlight, forest_scene
@@ -101,10 +104,13 @@ def test_closest_passes_are_near_and_apart() -> None:
     assert [round(float(track.xy_m[i, 0])) for i in passes] == [5, 20]
 
 
-def test_braking_by_gate_and_mission_at_once_counts_once() -> None:
-    braked = forest_flight().braking()
-    assert [reason for _, reason in braked] == ["obstacle_close"]
-    assert braked[0][0] == pytest.approx(14.0, abs=0.2)
+def test_brakings_and_stops_are_told_apart_and_the_end_is_neither() -> None:
+    series = forest_flight()
+    t = series.start_ns + 30 * S
+    series.add("gate", GateOutput(t, State.BRAKING, Action.NEUTRAL, Reason.GOAL_REACHED))
+    for found in (series.braking(), series.stops()):
+        assert [reason for _, reason in found] == ["obstacle_close"]
+        assert found[0][0] == pytest.approx(14.2, abs=0.2)  # five decisions a second
 
 
 def test_strips_are_drawn_whole_and_of_nothing(tmp_path: Path) -> None:

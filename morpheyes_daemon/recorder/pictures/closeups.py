@@ -52,8 +52,8 @@ def _frame(panel: Any, track: Track, i: int) -> None:
     for spine in panel.spines.values():
         spine.set_color("#888888")
         spine.set_linewidth(0.8)
-    panel.plot([x + half - 1.15, x + half - 0.15], [y + tall - 0.14] * 2, color=INK, linewidth=1.6)
-    panel.text(x + half - 0.65, y + tall - 0.2, "1 m", ha="center", va="bottom", fontsize=7.5, color=INK)
+    panel.plot([x + half - 1.15, x + half - 0.15], [y + tall - 0.14] * 2, color=INK, linewidth=1.6, zorder=9)
+    panel.text(x + half - 0.65, y + tall - 0.2, "1 m", ha="center", va="bottom", fontsize=7.5, color=INK, zorder=9)
 
 
 def _draw(panel: Any, track: Track, scene: Scene, footprint: Footprint, i: int) -> None:
@@ -64,21 +64,20 @@ def _draw(panel: Any, track: Track, scene: Scene, footprint: Footprint, i: int) 
     for corners in scene.polygons:
         panel.add_patch(Polygon(corners, closed=True, facecolor="#a79a8b", edgecolor="#6d6257", lw=0.8))
     panel.plot(*track.xy_m.T, color="#9aa1ab", linewidth=0.8, zorder=2)
-    for j in _spaced(track, i):
-        hull, bar = boxes(footprint, float(track.baseline_m[j]))
-        b, g, r = (c / 255 for c in baseline_bgr(float(track.baseline_m[j])))
-        at, yaw = track.xy_m[j], float(track.yaw_rad[j])
-        strength: dict[str, Any] = NEAREST if j == i else AROUND
-        panel.add_patch(Polygon(placed(hull, at, yaw), facecolor="white", edgecolor=INK, **strength))
-        panel.add_patch(Polygon(placed(bar, at, yaw), facecolor=(r, g, b), edgecolor=INK, **{**strength, "lw": 0.5}))
+    around = track.spaced(i, EVERY_M, 6)
+    for j in range(len(around)):
+        _draw_vehicle(panel, around, j, footprint, AROUND)
+    _draw_vehicle(panel, track, i, footprint, NEAREST)
 
 
-def _spaced(track: Track, i: int) -> list[int]:
-    """Samples around `i` that are `EVERY_M` of path apart, `i` among them."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(track.xy_m, axis=0), axis=1))])
-    wanted = along[i] + EVERY_M * np.arange(-6, 7)
-    wanted = wanted[(wanted >= along[0]) & (wanted <= along[-1])]
-    return sorted({int(np.argmin(np.abs(along - a))) for a in wanted} | {i}, key=lambda j: (j == i, j))
+def _draw_vehicle(panel: Any, track: Track, j: int, footprint: Footprint, strength: dict[str, Any]) -> None:
+    from matplotlib.patches import Polygon
+
+    baseline_m, at, yaw = float(track.baseline_m[j]), track.xy_m[j], float(track.yaw_rad[j])
+    hull, bar = boxes(footprint, baseline_m)
+    b, g, r = (c / 255 for c in baseline_bgr(baseline_m))
+    panel.add_patch(Polygon(placed(hull, at, yaw), facecolor="white", edgecolor=INK, **strength))
+    panel.add_patch(Polygon(placed(bar, at, yaw), facecolor=(r, g, b), edgecolor=INK, **{**strength, "lw": 0.5}))
 
 
 def _letter(axes: Any, track: Track, scene: Scene, i: int, letter: str) -> None:

@@ -81,6 +81,7 @@ def _frame(axes: Any, limits: Limits, title: str) -> None:
     axes.set_xlabel("north [m]", fontsize=9)
     axes.set_ylabel("east [m]", fontsize=9, labelpad=1)
     axes.tick_params(labelsize=8, length=3, color="#888888")
+    axes.yaxis.get_major_locator().set_params(integer=True)
     quiet(axes)
     axes.set_title(title, fontsize=10, loc="left", pad=6)
 
@@ -124,10 +125,11 @@ def draw_track(axes: Any, track: Track, footprint: Footprint, points_per_m: floa
 def _draw_marks(axes: Any, series: FlightSeries, track: Track, *, collided: bool) -> None:
     if len(track) == 0:
         return
-    where = track.xy_m[[track.nearest(t) for t, _ in series.braking()]]
-    if len(where):
-        style = {"color": "white", "markeredgecolor": RED, "markersize": 6, "markeredgewidth": 1.3}
-        axes.plot(where[:, 0], where[:, 1], "v", zorder=7, label="made to stop", **style)
+    style = {"linestyle": "none", "markeredgecolor": RED, "markersize": 6, "markeredgewidth": 1.3, "zorder": 7}
+    for times, fill, label in ((series.stops(), "white", "stopped to look"), (series.braking(), RED, "braked")):
+        if times:
+            where = track.xy_m[[track.nearest(t) for t, _ in times]]
+            axes.plot(where[:, 0], where[:, 1], marker="v", color=fill, label=label, **style)
     if collided:
         style = {"color": RED, "markeredgecolor": "white", "markersize": 12}
         axes.plot(*track.xy_m[-1], "X", zorder=8, label="collided", **style)

@@ -42,6 +42,17 @@ class Track:
         """Return the index of the sample nearest in time."""
         return int(np.argmin(np.abs(self.times_s - time_s)))
 
+    def spaced(self, i: int, apart_m: float, count: int) -> Track:
+        """Return the track around sample `i`, `count` samples to either side, `apart_m` of path from each other."""
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.xy_m, axis=0), axis=1))])
+        wanted = along[i] + apart_m * np.arange(-count, count + 1)
+        wanted = wanted[(wanted >= along[0]) & (wanted <= along[-1])]
+        x, y, t, yaw, baseline = (
+            np.interp(wanted, along, column)
+            for column in (self.xy_m[:, 0], self.xy_m[:, 1], self.times_s, self.yaw_rad, self.baseline_m)
+        )
+        return Track(t, np.stack([x, y], axis=1), yaw, baseline)
+
 
 def boxes(footprint: Footprint, baseline_m: float) -> tuple[Array, Array]:
     """Return the corners (4, 2) of hull and bar in the body frame: forward, right."""
