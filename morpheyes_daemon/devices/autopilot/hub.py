@@ -202,7 +202,7 @@ class AutopilotHub:
 
     def _take_state(self, message: Message, now_ns: int) -> None:
         boot_ms = getattr(message, "time_boot_ms", None)
-        if boot_ms is not None and self._telemetry.boot.rebooted(boot_ms, now_ns):
+        if boot_ms is not None and self._telemetry.boot.rebooted(boot_ms):
             self._telemetry.boot.reset()
             self._event(Reason.AUTOPILOT_REBOOTED, f"it has been up for {boot_ms / 1000:.1f} s")
             self._ask_all()

@@ -101,6 +101,7 @@ class ParameterClient:
         """
         kind = self._types.get(name, dialect.MAV_PARAM_TYPE_REAL32)
         for _ in range(SET_TRIES):
+            self._arrived.discard(name)
             self._send(dialect.MAVLink_param_set_message(self._target, 1, name.encode(), value, kind))
             if await self._answer(name):
                 kept = self._values[name]
@@ -111,7 +112,6 @@ class ParameterClient:
 
     async def _answer(self, name: str) -> bool:
         """Wait for a value of `name`; False when none came in time."""
-        self._arrived.discard(name)
         try:
             async with asyncio.timeout(SET_WAIT_S):
                 while name not in self._arrived:
