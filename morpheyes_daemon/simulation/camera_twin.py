@@ -66,7 +66,9 @@ class _Lens:
 
     def depth(self, rendered: Rendered) -> FloatMap:
         """Return depth along z at the distorted pixels (nearest sample)."""
-        return np.asarray(cv2.remap(rendered.depth_m, self.map, np.empty(0), cv2.INTER_NEAREST), dtype=np.float32)
+        # the second map must be None: OpenCV 5 makes rubbish of an empty array there
+        nearest = cv2.remap(rendered.depth_m, self.map, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
+        return np.asarray(nearest, dtype=np.float32)
 
 
 class CameraTwin:
