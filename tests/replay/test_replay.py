@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,50 +15,72 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.config import MissionFile, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.experiments.replay import replay
-from morpheyes_daemon.messages import DepthSummary, Perception, VehicleState
-from morpheyes_daemon.perception import build_strategy
+from morpheyes_daemon.messages import DepthSummary, FloatMap, Intent, MissionCommand, Perception, VehicleState
+from morpheyes_daemon.perception import build_craft
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.recorder import Recorder
-from morpheyes_daemon.shipped import load_mission
-from morpheyes_daemon.strategies.base import Observation
-from morpheyes_daemon.strategies.profile import ObstacleProfile
+from morpheyes_daemon.strategies.base import Observation, Strategy, StrategyParameters
+from morpheyes_daemon.strategies.registry import BUILT_IN
 from tests.hand_clock import HandClock
 
 STEPS = 25
 
 
-def vehicle_at(x_m: float, t_ns: int) -> VehicleState:
-    return VehicleState(t_ns=t_ns, position_t_ns=t_ns, attitude_t_ns=t_ns, p_ned_m=(x_m, 0.1, -1.5),
-                        v_ned_m_s=(1.5, 0.02, 0.0), height_m=1.5, rc_us=(1500, 1500), armed=True, landed=False)
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """A percept with all that is hard to write down: single precision, an empty array, an infinity."""
+
+    points_ned_m: FloatMap
+    nearest_m: float
 
 
-def profile_at(x_m: float, t_ns: int, rng: np.random.Generator) -> ObstacleProfile:
-    """A tree ahead and one beside, in 64 bins, now and then nothing at all."""
-    azimuth = np.linspace(-0.4, 0.4, 80)
-    range_m = np.where(np.abs(azimuth - 0.1) < 0.03, 9.0 - x_m, np.inf)
-    points = rng.normal((8.0, 0.8), 0.05, size=(0 if t_ns % (7 * S) == 0 else 12, 2))
-    none = np.zeros(80, dtype=bool)
-    return ObstacleProfile(t_ns, (x_m, 0.1, -1.5), (x_m + 0.09, 0.1), azimuth, range_m, none, none, points, 7.5, 0.5)
+class WeaverParameters(StrategyParameters):
+    gain: float = 0.04
+
+
+class Weaver(Strategy):
+    """Flies by everything it ever saw, so that one wrong bit anywhere shows in all that follows."""
+
+    Parameters = WeaverParameters
+
+    def __init__(self, parameters: StrategyParameters, craft: object) -> None:
+        super().__init__(parameters, craft)
+        self._sum = 0.0
+
+    def decide(self, observation: Observation) -> MissionCommand:
+        sighting: Sighting = observation.percept
+        self._sum += float(np.sin(sighting.points_ned_m.astype(np.float64)).sum()) + observation.vehicle.p_ned_m[0]
+        clear_m = min(sighting.nearest_m, observation.reserve_m)
+        assert isinstance(self.parameters, WeaverParameters)
+        return MissionCommand(
+            observation.summary.seq, observation.now_ns, observation.now_ns + S, Intent.FLY, None,
+            (math.cos(self._sum), math.sin(self._sum), 0.0), self._sum, None, self.parameters.gain * clear_m, clear_m,
+            observation.summary.t_ns, observation.at_exposure.p_ned_m, clear_m, detail={"sum": self._sum},
+        )
+
+
+@pytest.fixture(autouse=True)
+def known_strategy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(BUILT_IN, "weaver", f"{__name__}:Weaver")
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight of 25 decisions of the real forest strategy on made-up profiles."""
-    config, mission = VehicleConfig(camera=SimCameraConfig(), servo={"backend": "serial"}), load_mission("forest")
-    topics, events, clock = Topics.create(), EventLog(), HandClock()
+    config = VehicleConfig(camera=SimCameraConfig(), servo={"backend": "serial"})
+    topics, events, clock, rng = Topics.create(), EventLog(), HandClock(), np.random.default_rng(3)
     path = tmp_path_factory.mktemp("replay") / "flight.mcap"
-    header = flight_header("forest", mission, config, "5f1e", 0.0)
+    header = flight_header("weaver", MissionFile(strategy="weaver"), config, "5f1e", 0.0)
     recorder = Recorder(topics, events, clock, path, header, image_rate_hz=None, threaded=False)
-    strategy, rng = build_strategy(mission, config), np.random.default_rng(3)
+    strategy = Weaver(WeaverParameters(), build_craft(config))
     for k in range(STEPS):
         clock.t_ns += S // 5
-        x_m = 0.3 * k
         summary = DepthSummary(k, clock.t_ns - S // 10, clock.t_ns, 0.2, 0.001, 370.0, 0.82, 0.25, 0.5, 0.9, 0.0,
-                               9.0 - x_m, 0.05, "5f1e")
-        seen = Perception(summary, profile_at(x_m, summary.t_ns, rng), np.full(72, math.nan, np.float32))
-        topics.perception.publish(seen)
-        now, then = vehicle_at(x_m + 0.15, clock.t_ns), vehicle_at(x_m, summary.t_ns)
-        observation = Observation(clock.t_ns, seen.percept, summary, now, then, 0.2, 1.1, True)
+                               9.0 - 0.3 * k, 0.05, "5f1e")
+        points = rng.normal(size=(k % 4 * 30, 2)).astype(np.float32)
+        sighting = Sighting(points, math.inf if k % 7 == 0 else float(rng.uniform(1, 9)))
+        topics.perception.publish(Perception(summary, sighting, np.full(72, math.nan, np.float32)))
+        vehicles = [VehicleState(t_ns=clock.t_ns, p_ned_m=tuple(rng.normal(size=3).tolist())) for _ in range(2)]
+        observation = Observation(clock.t_ns, sighting, summary, vehicles[0], vehicles[1], 0.2, math.pi, True)
         topics.observation.publish(observation)
         topics.command.publish(strategy.decide(observation))
     recorder.close()
@@ -66,17 +89,27 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_same_observations_give_the_same_commands_bit_for_bit(log: Path) -> None:
     result = replay(log)
-    assert result.decisions == STEPS
-    assert result.without_percept == 0
+    assert (result.decisions, result.without_percept) == (STEPS, 0)
     assert result.differences == []
 
 
 def test_a_changed_mission_shows_where_it_decides_differently(log: Path) -> None:
-    mission = load_mission("forest")
-    other = MissionFile(strategy="forest", parameters={**mission.parameters, "baseline_gain": 0.02})
-    result = replay(log, other)
-    assert len(result.differences) > 0
-    assert {name for difference in result.differences for name in difference.fields} <= {"baseline_m", "detail"}
+    result = replay(log, MissionFile(strategy="weaver", parameters={"gain": 0.05}))
+    assert len(result.differences) == STEPS
+    assert set(result.differences[0].fields) == {"baseline_m"}
+
+
+def test_one_wrong_bit_shows(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def once_wrong(self: Weaver, observation: Observation) -> MissionCommand:
+        if observation.summary.seq == 10:
+            self._sum = math.nextafter(self._sum, math.inf)
+        return decide(self, observation)
+
+    decide = Weaver.decide
+    monkeypatch.setattr(Weaver, "decide", once_wrong)
+    differences = replay(log).differences
+    assert differences
+    assert differences[0].t_s == pytest.approx(11 * 0.2)
 
 
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[int, str]:
@@ -93,10 +126,11 @@ def test_command_says_same_or_different(
     code, out = run(capsys, monkeypatch, "replay", str(log), "--json")
     assert (code, json.loads(out)["same"], json.loads(out)["decisions"]) == (0, True, STEPS)
     changed = tmp_path / "changed.yaml"
-    changed.write_text("strategy: forest\nparameters: {goal: {forward_m: 20.0}, speed_m_s: 0.5}\n")
+    changed.write_text("strategy: weaver\nparameters: {gain: 0.05}\n")
     code, out = run(capsys, monkeypatch, "replay", str(log), "--mission", str(changed))
     assert code == 1
-    assert "v_ned_m_s" in out
+    assert "baseline_m" in out
+    assert "and 15 more" in out
 
 
 def test_a_log_without_decisions_is_a_sentence(
