@@ -144,7 +144,8 @@ class Perception:
 class VehicleState:
     """The newest of what the autopilot said, each group with its own stamp (0: never heard).
 
-    `rc_us` are RC_CHANNELS 1..16 (0: absent), `rc_rssi` their signal strength 0..254 (255: not measured). `position_t_ns` stamps p and v. `custom_mode` is ArduCopter's number.
+    `rc_us` are RC_CHANNELS 1..16 (0: absent), `rc_rssi` their signal strength 0..254 (255: not measured).
+    `position_t_ns` stamps p and v. `custom_mode` is ArduCopter's number.
     """
 
     t_ns: int = 0
