@@ -13,7 +13,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.simulation import meshes, textures
@@ -47,6 +47,12 @@ class ForestWorld(Section):
     run_in_m: float = Field(15.0, ge=2, le=100, description="trees are planted this far behind the start")
     max_lean_deg: float = Field(2.0, ge=0, le=10)
     conifers: float = Field(0.4, ge=0, le=1, description="share of trees")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ForestWorld:
+        if self.radius_min_m > self.radius_max_m:
+            raise ValueError("radius_min_m must not be greater than radius_max_m")
+        return self
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,108 @@
+"""Worlds keep their promises: density, gaps, no carved path; bad files are refused with a sentence."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morpheyes_daemon.errors import ConfigError
+from morpheyes_daemon.simulation.forest import ForestWorld, Tree, plant
+from morpheyes_daemon.simulation.worlds import build_world, load_world, world_names
+
+CONTROL_RADIUS_M = 0.17
+"""Footprint of the straight-line control run."""
+
+
+def default_forest() -> ForestWorld:
+    world = load_world("forest").world
+    assert isinstance(world, ForestWorld)
+    return world
+
+
+def centre_at(tree: Tree, height_m: float) -> tuple[float, float, float]:
+    middle = tree.base + height_m / tree.height_m * (tree.top - tree.base)
+    return float(middle[0]), float(middle[1]), tree.radius_at_m(height_m)
+
+
+def straight_line_collides(trees: list[Tree], course_m: float) -> bool:
+    for tree in trees:
+        x, y, radius = centre_at(tree, 1.5)
+        beside = math.hypot(x - min(max(x, 0.0), course_m), y)
+        if beside < radius + CONTROL_RADIUS_M:
+            return True
+    return False
+
+
+def test_flying_straight_on_collides_in_three_of_four_forests() -> None:
+    world = default_forest()
+    collided = [straight_line_collides(plant(world, seed), world.course_m) for seed in range(40)]
+    assert sum(collided) >= 30
+
+
+@pytest.mark.parametrize("trees_per_ha", [100, 400, 1000])
+def test_forest_has_its_density_and_its_gaps(trees_per_ha: int) -> None:
+    world = ForestWorld(kind="forest", trees_per_ha=trees_per_ha)
+    trees = plant(world, seed=1)
+    area_ha = (world.run_in_m + world.course_m + world.run_out_m) * 2 * world.half_width_m / 1e4
+    assert len(trees) == round(trees_per_ha * area_ha)
+    for height_m in (0.0, 1.5, 3.0):
+        x, y, radius = np.array([centre_at(tree, height_m) for tree in trees]).T
+        gap = np.hypot(x[:, None] - x, y[:, None] - y) - radius[:, None] - radius
+        assert gap[~np.eye(len(trees), dtype=bool)].min() >= 0.8
+    assert all(0.10 <= tree.radius_m <= 0.40 for tree in trees)
+
+
+def test_only_the_ends_of_the_course_are_cleared() -> None:
+    world = default_forest()
+    nearest_to_line = []
+    for seed in range(10):
+        for tree in plant(world, seed):
+            x, y, radius = tree.base[0], tree.base[1], tree.radius_m
+            assert min(math.hypot(x, y), math.hypot(x - world.course_m, y)) >= world.clearing_m + radius
+            if 3 < x < world.course_m - 3:
+                nearest_to_line.append(abs(y))
+    # as many trees stand within half a metre of the line as anywhere else
+    nearest = np.array(nearest_to_line)
+    assert np.count_nonzero(nearest < 0.5) == pytest.approx(10 * 74 * 1.0 * 0.04, rel=0.5)
+
+
+def test_the_same_seed_plants_the_same_forest() -> None:
+    a, b, other = (plant(default_forest(), seed) for seed in (3, 3, 4))
+    assert all(np.array_equal(p.base, q.base) and p.radius_m == q.radius_m for p, q in zip(a, b, strict=True))
+    assert not np.array_equal(a[0].base, other[0].base)
+
+
+def test_all_shipped_worlds_can_be_built() -> None:
+    for name in world_names():
+        world = build_world(load_world(name), seed=0)
+        assert len(world.scene.meshes) + len(world.scene.moving) > 0
+        assert np.isfinite([*world.start_ned_m, *world.goal_ned_m]).all()
+
+
+def test_a_world_is_found_by_name_or_by_path(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("world:\n  kind: forest\n  trees_per_ha: 50\n")
+    mine = load_world(str(path)).world
+    assert isinstance(mine, ForestWorld)
+    assert mine.trees_per_ha == 50
+    with pytest.raises(ConfigError, match="no world 'jungle'.*forest"):
+        load_world("jungle")
+
+
+def test_a_bad_world_file_names_line_and_key(tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text("world:\n  kind: forest\n  trees_per_ha: -3\n")
+    with pytest.raises(ConfigError, match=r"bad\.yaml:3: world\.trees_per_ha"):
+        load_world(str(path))
+    path.write_text("world:\n  kind: forest\n  tree_per_ha: 3\n")
+    with pytest.raises(ConfigError, match="no such key"):
+        load_world(str(path))
+    path.write_text("world:\n  kind: swamp\n")
+    with pytest.raises(ConfigError, match="swamp"):
+        load_world(str(path))
+    path.write_text("world:\n  kind: forest\n  radius_min_m: 0.3\n  radius_max_m: 0.2\n")
+    with pytest.raises(ConfigError, match="radius_min_m"):
+        load_world(str(path))
