@@ -23,6 +23,8 @@ from morpheyes_daemon.stereo.rectify import rectifying_rotation
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
 
+_LATE_MODEL = 0.05
+"""Share by which the measured time offset may be wrong for want of an exact motion."""
 _MEMORY = 0.95
 """How much of the rows' evidence is left one frame later: twenty frames count."""
 
@@ -125,8 +127,7 @@ class DriftMonitor:
         f_px = depth.pinhole.f_px
         findings = self._judge_rows(offsets.median_px, f_px, nominal_m)
         if not findings and offsets.median_px < 2 * self.limits.rows_px:
-            look = Look(depth.t_ns, left, right, disparity, depth.baseline_m, depth.pinhole, motion, self._late_s)
-            self._yaw.add(look)
+            self._yaw.add(Look(depth.t_ns, left, right, disparity, depth.baseline_m, depth.pinhole, motion, *self._late))
             findings += self._judge_yaw(f_px, nominal_m)
         findings += self._judge_late()
         report = self._report(offsets.median_px, offsets.count, self._fit, tuple(findings))
@@ -135,10 +136,12 @@ class DriftMonitor:
         return report
 
     @property
-    def _late_s(self) -> float:
-        """The time offset as measured when that is sharp, as declared otherwise."""
-        sharp = self._fit is not None and self._fit.late_sigma_s < 0.25 * self.limits.late_change_s
-        return self._fit.late_s if sharp and self._fit is not None else self.limits.late_s
+    def _late(self) -> tuple[float, float]:
+        """The time offset and its sigma: as measured when that is sharp, as declared otherwise."""
+        fit, limits = self._fit, self.limits
+        if fit is None or fit.late_sigma_s > 0.25 * limits.late_change_s:
+            return limits.late_s, limits.late_change_s
+        return fit.late_s, math.hypot(fit.late_sigma_s, _LATE_MODEL * fit.late_s)
 
     def _forget(self) -> None:
         """Start collecting anew, since what was collected belongs to another rectification."""

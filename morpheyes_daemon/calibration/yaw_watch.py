@@ -33,6 +33,8 @@ _STATIC_PX = 0.8
 _STATIC_SHARE = 0.75
 """... and this share of the points must, or the scene is taken to move."""
 _NOISE_PX = 0.15
+_TURN_RATE_SIGMA_RAD_S, _SPEED_SIGMA_M_S = 0.01, 0.05
+"""How well the autopilot knows the vehicle's motion; with late eyes its error is one of all disparities."""
 _REMEMBERED = 20
 _WORTHWHILE = 1.1
 """A pair is only worth working out when it tells this much more than the best one."""
@@ -55,7 +57,10 @@ STILL = Uncertain(translation_m=1e-3, turn_rad=1e-3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """One rectified grey pair (H, W) with its disparity (H, W; NaN unknown), true baseline and the eye's motion."""
+    """One rectified grey pair (H, W) with its disparity (H, W; NaN unknown), true baseline and the eye's motion.
+
+    `late_s` is by how much the right eye exposes after the left one.
+    """
 
     t_ns: int
     left: Image
@@ -65,6 +70,7 @@ class Look:
     pinhole: Pinhole
     motion: EyeMotion
     late_s: float = 0.0
+    late_sigma_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,10 +261,21 @@ def _solve(
     left = error - columns @ solution
     static = np.abs(left) < _STATIC_PX * np.sqrt(1.0 + slope**2)
     spread = float(np.sqrt(np.mean((left[kept] / noise[kept]) ** 2))) if kept.any() else math.inf
-    systematic = _SYSTEMATIC_PX / leverage(first.baseline_m, second.baseline_m) / f
+    by_time = math.hypot(ratio * _time_px(first, depth_1), _time_px(second, depth_2)) / math.hypot(1.0, ratio)
+    systematic = math.hypot(_SYSTEMATIC_PX, by_time) / leverage(first.baseline_m, second.baseline_m) / f
     sigma = math.hypot(math.sqrt(covariance[0, 0]) * max(1.0, spread), systematic)
     residual = float(np.median(np.abs(left)))
     return YawFit(float(solution[0]), sigma, int(np.count_nonzero(static)), float(static.mean()), residual)
+
+
+def _time_px(look: Look, depth_m: Array) -> float:
+    """Return how wrong all disparities may be together since the eyes expose at different times, one sigma."""
+    if not np.any(look.motion.w_rect_rad_s) and not np.any(look.motion.v_rect_m_s):
+        return 0.0
+    near_m = float(np.median(depth_m))
+    rate = abs(float(look.motion.w_rect_rad_s[1])) + abs(float(look.motion.v_rect_m_s[0])) / near_m
+    rate_sigma = math.hypot(_TURN_RATE_SIGMA_RAD_S, _SPEED_SIGMA_M_S / near_m)
+    return look.pinhole.f_px * math.hypot(look.late_sigma_s * rate, look.late_s * rate_sigma)
 
 
 def _robust(columns: Array, values: Array, prior: Array) -> tuple[Array, Array, NDArray[np.bool_]]:

@@ -82,6 +82,7 @@ def render(
         str, typer.Option("--baselines", help="How many, equally spaced over 100-300 mm, or lengths such as 100,200.")
     ] = "10",
     views: Annotated[int, typer.Option("--views", min=3, max=200, help="Pairs per baseline.")] = 12,
+    visits: Annotated[bool, typer.Option("--visits", help="The servo goes away and back before every pair.")] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Which twin rig.")] = 0,
     size: Annotated[str, typer.Option("--size", help="Image size, WIDTHxHEIGHT.")] = "640x480",
     board: BoardOption = None,
@@ -97,7 +98,7 @@ def render(
     chosen = choose_board(usual, board, square_mm, marker_mm, checked=False)
     nominal_m = choose_baselines_m(baselines_mm, RANGE_M)
     with progress_line() as progress:
-        render_folder(out, seed, nominal_m, views, chosen, _size(size), progress)
+        render_folder(out, seed, nominal_m, views, chosen, _size(size), visits, progress)
     typer.echo(f"{len(nominal_m)} baselines, {views} pairs each: {out}; next: morpheyes calibrate solve {out}")
 
 

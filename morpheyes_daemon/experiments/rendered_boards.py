@@ -45,11 +45,13 @@ def twin_from_name(name: str) -> RigTwin | None:
     return RigTwin(int(match[2]), int(match[3]), seed=int(match[1])) if match else None
 
 
-def settled_m(twin: RigTwin, seed: int, nominal_m: Sequence[float]) -> list[float]:
-    """Return the true baselines at which the servo came to rest for the nominal ones."""
+def settled_m(twin: RigTwin, seed: int, nominal_m: Sequence[float], views: int, visits: bool) -> Array:
+    """Return the true baselines (M, views) at which the servo came to rest: anew for each view, or once for all."""
     rng = np.random.default_rng([seed, 520])
     sigma_m = ServoMotion().repeatability_sigma_mm / 1e3
-    return [twin.actual_m(nominal) + sigma_m * float(rng.standard_normal()) for nominal in nominal_m]
+    error_m = sigma_m * rng.standard_normal((len(nominal_m), views if visits else 1))
+    actual_m = np.array([[twin.actual_m(nominal)] for nominal in nominal_m])
+    return np.asarray(np.broadcast_to(actual_m + error_m, (len(nominal_m), views)))
 
 
 def render_folder(
@@ -59,16 +61,19 @@ def render_folder(
     views: int = DEFAULT_VIEWS,
     board: Board = DEFAULT_BOARD,
     size: tuple[int, int] = (640, 480),
+    visits: bool = False,
     progress: Progress = silent,
 ) -> None:
     """Write left and right PNGs per baseline, and board.yaml with what a person would have measured.
 
-    Raises InputError when the folder holds pictures already.
+    With `visits` the servo goes away and comes back before every pair. Raises InputError when the folder is not
+    empty.
     """
     _refuse_full(out)
     twin = RigTwin(*size, seed=seed)
+    true_m = settled_m(twin, seed, nominal_m, views, visits)
     out.mkdir(parents=True, exist_ok=True)
-    drawn = _drawn(twin, seed, nominal_m, views, board, lambda pair: pair)
+    drawn = _drawn(twin, seed, true_m, board, lambda pair: pair)
     for done, (index, view, pair) in enumerate(drawn, start=1):
         folder = out / f"{nominal_m[index] * 1e3:g}mm"
         folder.mkdir(exist_ok=True)
@@ -90,7 +95,8 @@ def observe_twin(
     """Return the corners that `render_folder` and `detection.observe` would give, without the files between."""
     twin = RigTwin(*size, seed=seed)
     names, baselines, seen = [], [], []
-    drawn = _drawn(twin, seed, nominal_m, views, board, lambda pair: _both(pair, board))
+    true_m = settled_m(twin, seed, nominal_m, views, visits=False)
+    drawn = _drawn(twin, seed, true_m, board, lambda pair: _both(pair, board))
     for done, (index, view, corners) in enumerate(drawn, start=1):
         progress("calibrating on rendered boards", done, len(nominal_m) * views)
         if corners is not None:
@@ -103,18 +109,17 @@ def observe_twin(
 
 
 def _drawn(
-    twin: RigTwin, seed: int, nominal_m: Sequence[float], views: int, board: Board, use: Callable[[RawPair], T]
+    twin: RigTwin, seed: int, true_m: Array, board: Board, use: Callable[[RawPair], T]
 ) -> Iterator[tuple[int, int, T]]:
     """Yield (baseline, view, what `use` makes of the pair) in order; two threads draw, with the same bits as one."""
-    true_m = settled_m(twin, seed, nominal_m)
     cameras = [BoardTwin(twin, board, seed) for _ in range(_WORKERS)]
 
     def draw(worker: int, index: int) -> list[T]:
-        return [use(pair) for pair in cameras[worker].pairs(true_m[index], views)]
+        return [use(pair) for pair in cameras[worker].pairs(true_m[index].tolist())]
 
     with ThreadPoolExecutor(_WORKERS) as pool:
-        for first in range(0, len(nominal_m), _WORKERS):
-            indices = range(first, min(first + _WORKERS, len(nominal_m)))
+        for first in range(0, len(true_m), _WORKERS):
+            indices = range(first, min(first + _WORKERS, len(true_m)))
             for index, results in zip(indices, pool.map(draw, range(len(indices)), indices), strict=True):
                 yield from ((index, view, result) for view, result in enumerate(results))
 

@@ -8,7 +8,7 @@ in both eyes.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Protocol, cast
 
 import cv2
@@ -119,15 +119,15 @@ class BoardTwin:
         still = Sensor(auto_exposure=False) if sensor is None else sensor
         self._camera = CameraTwin(cast(Renderer, self._scene), rig, self._mount, still, seed=seed)
 
-    def pairs(self, baseline_true_m: float, views: int) -> Iterator[RawPair]:
-        """Yield `views` raw pairs (BGR) of the board at drawn poses, the eyes a true baseline apart."""
-        rng = np.random.default_rng([self._seed, 510, round(baseline_true_m * 1e9)])
-        poses = draw_poses(self._rig, self._board, baseline_true_m, views, rng)
+    def pairs(self, baselines_true_m: Sequence[float]) -> Iterator[RawPair]:
+        """Yield raw pairs (BGR) of the board at drawn poses, one for each true baseline (all about the same)."""
+        rng = np.random.default_rng([self._seed, 510, round(baselines_true_m[0] * 1e9)])
+        poses = draw_poses(self._rig, self._board, max(baselines_true_m), len(baselines_true_m), rng)
         first = len(self._scene.T_ned_board)
         self._scene.T_ned_board += [T_frd_rig(self._mount) @ T for T in poses]
-        for view in range(views):
-            noise = 1000 * round(baseline_true_m * 1e7) + view
-            yield self._camera.render_pair((first + view) * S, noise, lambda _: np.eye(4), baseline_true_m)
+        for view, true_m in enumerate(baselines_true_m):
+            noise = 1000 * round(true_m * 1e7) + view
+            yield self._camera.render_pair((first + view) * S, noise, lambda _: np.eye(4), true_m)
 
 
 def draw_poses(
