@@ -41,6 +41,7 @@ class MavlinkServer:
         self._host, self._port = host, port
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
+        self._serving: set[asyncio.Task[None]] = set()
 
     @property
     def url(self) -> str:
@@ -67,10 +68,14 @@ class MavlinkServer:
         self._server.close()
         for writer in list(self._writers):
             writer.close()
+        await asyncio.gather(*self._serving, return_exceptions=True)
         await self._server.wait_closed()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        client = _Client(writer)
+        client, task = _Client(writer), asyncio.current_task()
+        assert task is not None
+        self._serving.add(task)
+        task.add_done_callback(self._serving.discard)
         receive = self._twin.attach(client)
         self._writers.add(writer)
         try:
