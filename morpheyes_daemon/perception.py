@@ -24,12 +24,17 @@ from morpheyes_daemon.messages import (
     VehicleState,
     frozen,
 )
-from morpheyes_daemon.stereo.depth import DepthEstimator
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.stereo.depth import DepthEstimator, RectifiedPair
+from morpheyes_daemon.stereo.image_checks import AlikeCheck, FrozenCheck, ImageFault, exposure_faults, matching_faults
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import Craft, Strategy, View
 from morpheyes_daemon.strategies.registry import find_strategy
 from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rpy, pose
 from morpheyes_daemon.yaml_source import validate
+
+_REASONS = {ImageFault.MISALIGNED: Reason.CALIBRATION_DRIFT}
+"""What is no fault of the images but of the rig."""
 
 SECTORS = 72
 """Sectors of OBSTACLE_DISTANCE over the horizontal field of view."""
@@ -82,9 +87,8 @@ class Pipeline:
     """The image side of the daemon for one mission and one rig."""
 
     def __init__(self, config: VehicleConfig, mission: MissionFile, rig: RigModel) -> None:
-        self._estimator = DepthEstimator(
-            rig, config.stereo, (config.camera.width_px, config.camera.height_px)
-        )
+        self._estimator = DepthEstimator(rig, config.stereo, (config.camera.width_px, config.camera.height_px))
+        self._frozen, self._alike = FrozenCheck(), AlikeCheck()
         self._strategy = build_strategy(mission, config)
         self._T_frd_rig = build_craft(config).T_frd_rig
 
@@ -93,16 +97,27 @@ class Pipeline:
         started_s = stopwatch_s()
         pair = self._estimator.rectified(job.frame)
         depth = self._estimator.depth(job.frame, pair)
+        faults = self._image_faults(job.frame, pair, depth)
         view = View(depth, pair.left, pair.right, job.vehicle, self._T_frd_rig)
         percept = self._strategy.perceive(view)
         return Perception(
             summary=summarize(depth, stopwatch_s() - started_s),
             percept=percept,
             sectors_m=sectors(depth),
-            image_faults=(),
+            image_faults=faults,
             left_rect=_small(job.frame.left) if job.keep_images else None,
             depth_m=frozen(depth.depth_m[::2, ::2].copy()) if job.keep_images else None,
         )
+
+    def _image_faults(self, frame: StereoFrame, pair: RectifiedPair, depth: DepthMap) -> tuple[Reason, ...]:
+        """Return why the frame must not be flown on, empty when it may."""
+        found = exposure_faults(pair.left, pair.right)
+        found |= matching_faults(pair.left, pair.right, depth.valid_fraction)
+        found |= self._alike.check(pair.left, pair.right, depth.baseline_m * depth.pinhole.f_px / depth.depth_m)
+        if self._frozen.check(frame.left, frame.right):
+            found.add(ImageFault.FROZEN)
+        reasons = {_REASONS.get(fault, Reason.IMAGE_BAD) for fault in found}
+        return tuple(sorted(reasons, key=lambda reason: reason.number))
 
 
 def summarize(depth: DepthMap, compute_s: float) -> DepthSummary:

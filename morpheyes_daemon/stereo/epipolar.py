@@ -36,11 +36,15 @@ MIN_POINTS = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowOffsets:
-    """dv_px (n,) = row in the right eye - row in the left, of left points uv (n, 2) with disparity d_px (n,)."""
+    """dv_px (n,) = row in the right eye - row in the left, of left points uv (n, 2) with disparity d_px (n,).
+
+    `tried` counts the textured points that were looked for in the right eye.
+    """
 
     uv: Array
     d_px: Array
     dv_px: Array
+    tried: int = 0
 
     @property
     def count(self) -> int:
@@ -89,7 +93,10 @@ def row_offsets(left: Image, right: Image, disparity_px: FloatMap) -> RowOffsets
     good &= returned & (np.abs(back - start).max(axis=1) < RETURN_PX)
     good &= (np.abs(aside) < SIDEWAYS_PX) & (np.abs(down) < REACH_PX)
     return RowOffsets(
-        start[good].astype(np.float64), (d - aside)[good].astype(np.float64), down[good].astype(np.float64)
+        start[good].astype(np.float64),
+        (d - aside)[good].astype(np.float64),
+        down[good].astype(np.float64),
+        len(start),
     )
 
 

@@ -8,6 +8,7 @@ import pytest
 from morpheyes_daemon.messages import Pinhole
 from morpheyes_daemon.stereo.epipolar import RowFit, RowOffsets
 from morpheyes_daemon.stereo.image_checks import (
+    AlikeCheck,
     FrozenCheck,
     ImageFault,
     exposure_faults,
@@ -131,3 +132,32 @@ def test_only_sure_lateness_beyond_what_is_declared_is_a_fault(late_s, sigma_s, 
 
 def test_every_fault_says_what_it_is():
     assert all(fault.text and fault.value for fault in ImageFault)
+
+
+def disparity(left, right):
+    return match(left, right, 80).disparity_px
+
+
+def test_eyes_that_see_the_same_are_alike(pair):
+    check = AlikeCheck()
+    assert [check.check(*pair, disparity(*pair)) for _ in range(6)] == [set()] * 6
+
+
+def test_disparities_that_the_eyes_do_not_bear_out_are_told_at_once(pair):
+    left, right = pair
+    shuffled = np.random.default_rng(2).permuted(disparity(left, right), axis=1)
+    assert AlikeCheck().check(left, right, shuffled) == {ImageFault.UNLIKE}
+
+
+def test_rows_that_stay_apart_are_told_after_some_frames(pair):
+    left, right = pair
+    apart = np.roll(right, 1, axis=0)
+    check = AlikeCheck()
+    told = [check.check(left, apart, disparity(left, apart)) for _ in range(6)]
+    assert told == [set()] * 4 + [{ImageFault.MISALIGNED}] * 2
+
+
+def test_a_bare_wall_is_no_fault():
+    rng = np.random.default_rng(1)
+    left, right = (rng.normal(120, 1.0, (240, 320)).round().astype(np.uint8) for _ in range(2))
+    assert AlikeCheck().check(left, right, np.full((240, 320), 5.0, np.float32)) == set()
