@@ -145,8 +145,7 @@ def test_eyes_that_see_the_same_are_alike(pair):
 
 def test_disparities_that_the_eyes_do_not_bear_out_are_told_at_once(pair):
     left, right = pair
-    shuffled = np.random.default_rng(2).permuted(disparity(left, right), axis=1)
-    assert AlikeCheck().check(left, right, shuffled) == {ImageFault.UNLIKE}
+    assert AlikeCheck().check(left, right, disparity(left, right) + 12) == {ImageFault.UNLIKE}
 
 
 def test_rows_that_stay_apart_are_told_after_some_frames(pair):
