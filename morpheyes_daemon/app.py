@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -19,7 +20,7 @@ from morpheyes_daemon.control.flight_control import FlightControl
 from morpheyes_daemon.control.governor import Governor, GovernorLimits
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.vehicle_track import VehicleTrack
-from morpheyes_daemon.control.velocity import VelocityTuning
+from morpheyes_daemon.control.velocity import BRAKE_LEAN_RAD, VelocityTuning
 from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
 from morpheyes_daemon.devices.camera import Camera
 from morpheyes_daemon.devices.link import LinkOpener
@@ -219,8 +220,7 @@ class Daemon:
             return  # the doctor has just said so
         if self.control is not None and self.control.model == model:
             return  # the autopilot counts flight time in a parameter; the loop keeps what it has learned
-        lean_rad = min(self.config.safety.max_lean_deg * 0.0174533, model.lean_max_rad)
-        self.control = FlightControl(model, self._governor, VelocityTuning(max_lean_rad=lean_rad))
+        self.control = FlightControl(model, self._governor, velocity_tuning(self.config, model))
         self.gate.set_limits(limits)
 
     def _heed_doctor(self, findings: list[Finding]) -> None:
@@ -258,6 +258,14 @@ class Daemon:
         self.hub.send_named_float("me_age", report.ages_s["frame"])
         with contextlib.suppress(OSError):
             self._parts.tell(report)
+
+
+def velocity_tuning(config: VehicleConfig, model: LoiterModel) -> VelocityTuning:
+    """Return the velocity loop's bounds; without active braking a stop is neutral sticks."""
+    lean_rad = min(math.radians(config.safety.max_lean_deg), model.lean_max_rad)
+    brake_rad = min(BRAKE_LEAN_RAD, lean_rad)
+    stop_rad = brake_rad if config.safety.active_braking else 0.0
+    return VelocityTuning(max_lean_rad=lean_rad, brake_lean_rad=brake_rad, stop_lean_rad=stop_rad)
 
 
 def governor_limits(config: VehicleConfig) -> GovernorLimits:

@@ -22,6 +22,8 @@ Vector2 = tuple[float, float]
 STANDSTILL_M_S = 0.05
 """A wanted speed below this is a stop: neutral sticks, and Loiter holds the place by itself."""
 RANGEFINDER_FRESH_S = 0.5
+BRAKE_LEAN_RAD = math.radians(8.0)
+"""With the drag it slows down by 2 to 4 m/s2, and a camera tilted up by 8 degrees still sees the band it flies in."""
 
 
 @dataclass(frozen=True, slots=True)
