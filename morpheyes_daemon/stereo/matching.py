@@ -9,6 +9,7 @@ overrules the fine one there. The result does not depend on the number of thread
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,6 +59,8 @@ class MatchSettings:
     uniqueness_pct: int = 15
     left_right_px: int = 1
     speckle_per_image: float = 1 / 1200
+    island_per_image: float = 1 / 400
+    island_shore: float = 0.8
     row_step: int = 1
     coarse_width_px: int = 160
     coarse_range: float = 3.0
@@ -98,20 +101,25 @@ def match(
     """
     _require_pair(left, right, num_disparities)
     settings = settings or MatchSettings()
+    shape, step = left.shape, settings.row_step
     ceiling = min_disparity + num_disparities
-    disparity = _fine(left, right, min_disparity, num_disparities, settings)
-    _forget_unseen(disparity, left_seen, right_seen)
-    near = _too_near(left, right, min_disparity, num_disparities, settings)
+    near = _too_near(left, right, min_disparity, num_disparities, settings)[::step][: shape[0] // step]
+    if step > 1:
+        left, right = _shrunk(left, 1, step), _shrunk(right, 1, step)
+    speckle_px = round(left.size * settings.speckle_per_image)
+    disparity = semi_global(left, right, min_disparity, num_disparities, settings, speckle_px)
     near |= disparity > ceiling - 1.5
-    if left_seen is not None:
-        near &= left_seen
     disparity[near] = np.nan
-    return Match(disparity, near, _one_eyed(disparity, near, ceiling), float(ceiling))
+    left_seen, right_seen = (_rows_of(seen, step) for seen in (left_seen, right_seen))
+    _forget_unseen(disparity, near, left_seen, right_seen)
+    _forget_islands(disparity, round(left.size * settings.island_per_image), settings.island_shore)
+    one_eyed = _one_eyed(disparity, near, ceiling)
+    if step > 1:
+        disparity, near, one_eyed = (_grown(array, 1, step, shape) for array in (disparity, near, one_eyed))
+    return Match(disparity, near, one_eyed, float(ceiling))
 
 
-def semi_global(
-    left: Image, right: Image, low: int, count: int, settings: MatchSettings, speckle_px: int
-) -> FloatMap:
+def semi_global(left: Image, right: Image, low: int, count: int, settings: MatchSettings, speckle_px: int) -> FloatMap:
     """Return the disparity (H, W) float32 of left pixels, NaN where unknown or outside the right image."""
     block_area = settings.block_px**2
     matcher = cv2.StereoSGBM.create(
@@ -136,15 +144,6 @@ def semi_global(
     return np.asarray(disparity)
 
 
-def _fine(left: Image, right: Image, low: int, count: int, settings: MatchSettings) -> FloatMap:
-    height, width = left.shape
-    step = settings.row_step
-    if step > 1:
-        left, right = (_shrunk(eye, 1, step) for eye in (left, right))
-    disparity = semi_global(left, right, low, count, settings, round(left.size * settings.speckle_per_image))
-    return disparity if step == 1 else _grown(disparity, 1, step, (height, width))
-
-
 def _too_near(left: Image, right: Image, low: int, count: int, settings: MatchSettings) -> Mask:
     """Return where a coarse search over a longer range prefers a disparity beyond the fine search's ceiling."""
     height, width = left.shape
@@ -153,7 +152,7 @@ def _too_near(left: Image, right: Image, low: int, count: int, settings: MatchSe
     reach = disparity_range(count * settings.coarse_range / scale, small_left.shape[1])
     coarse = semi_global(small_left, small_right, low // scale, reach, settings, settings.coarse_speckle_px)
     beyond = coarse * scale > low + count + scale / 2
-    return np.asarray(_grown(beyond.view(np.uint8), scale, scale, (height, width)).view(np.bool_))
+    return _grown(beyond, scale, scale, (height, width))
 
 
 def _shrunk(image: Image, across: int, down: int) -> Image:
@@ -163,17 +162,24 @@ def _shrunk(image: Image, across: int, down: int) -> Image:
     return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
-def _grown(small: NDArray[Any], across: int, down: int, shape: tuple[int, int]) -> NDArray[Any]:
+def _grown(small: NDArray[Any], across: int, down: int, shape: tuple[int, ...]) -> NDArray[Any]:
     """Return `small` with every pixel repeated; what is left over at the right and bottom repeats the edge."""
+    drawn = small.view(np.uint8) if small.dtype == np.bool_ else small
     size = (small.shape[1] * across, small.shape[0] * down)
-    grown = cv2.resize(small, size, interpolation=cv2.INTER_NEAREST)
+    grown = cv2.resize(drawn, size, interpolation=cv2.INTER_NEAREST)
     missing = shape[0] - size[1], shape[1] - size[0]
-    return np.asarray(cv2.copyMakeBorder(grown, 0, missing[0], 0, missing[1], cv2.BORDER_REPLICATE))
+    whole = np.asarray(cv2.copyMakeBorder(grown, 0, missing[0], 0, missing[1], cv2.BORDER_REPLICATE))
+    return whole.view(np.bool_) if small.dtype == np.bool_ else whole
 
 
-def _forget_unseen(disparity: FloatMap, left_seen: Mask | None, right_seen: Mask | None) -> None:
+def _rows_of(seen: Mask | None, step: int) -> Mask | None:
+    return None if seen is None else seen[::step][: seen.shape[0] // step]
+
+
+def _forget_unseen(disparity: FloatMap, near: Mask, left_seen: Mask | None, right_seen: Mask | None) -> None:
     if left_seen is not None:
         disparity[~left_seen] = np.nan
+        near &= left_seen
     if right_seen is not None:
         # what an eye sees of a rectified row is one piece
         width = right_seen.shape[1]
@@ -181,6 +187,35 @@ def _forget_unseen(disparity: FloatMap, left_seen: Mask | None, right_seen: Mask
         last = np.where(right_seen.any(axis=1), width - 1 - right_seen[:, ::-1].argmax(axis=1), -1)
         partner = np.arange(width, dtype=np.float32) - disparity
         disparity[(partner < first[:, None] - 0.5) | (partner > last[:, None] + 0.5)] = np.nan
+
+
+def _forget_islands(disparity: FloatMap, largest_px: int, shore: float) -> None:
+    """Forget small patches of disparity in a sea of unknown: where nothing can match, something always seems to.
+
+    A patch goes when more than the share `shore` of its neighbours is unknown; a thin branch stays, since on one side
+    of it lies what it does not hide.
+    """
+    none = np.iinfo(np.int16).min
+    unknown = np.isnan(disparity)
+    fixed = np.where(unknown, none, disparity * SUBPIXELS).astype(np.int16)
+    large = fixed.copy()
+    cv2.filterSpeckles(large, none, largest_px, SUBPIXELS)
+    count, labels = cv2.connectedComponents((fixed != large).view(np.uint8), connectivity=4)
+    around, sea = np.zeros(count), np.zeros(count)
+    for patch, beside, water in _neighbours(labels, unknown):
+        edge = (patch != beside) & (patch > 0)
+        around += np.bincount(patch[edge], minlength=count)
+        sea += np.bincount(patch[edge], weights=water[edge], minlength=count)
+    drowned = sea > shore * around
+    disparity[drowned[labels]] = np.nan
+
+
+def _neighbours(labels: NDArray[Any], unknown: Mask) -> Iterator[tuple[NDArray[Any], NDArray[Any], Mask]]:
+    """Yield labels, the labels on one side of them, and whether that side is unknown, for the four sides."""
+    yield labels[:, :-1], labels[:, 1:], unknown[:, 1:]
+    yield labels[:, 1:], labels[:, :-1], unknown[:, :-1]
+    yield labels[:-1], labels[1:], unknown[1:]
+    yield labels[1:], labels[:-1], unknown[:-1]
 
 
 def _one_eyed(disparity: FloatMap, near: Mask, ceiling: float) -> Mask:

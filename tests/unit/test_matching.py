@@ -6,7 +6,7 @@ import pytest
 
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages import Pinhole
-from morpheyes_daemon.stereo.matching import MatchSettings, _one_eyed, _runs, disparity_range, match
+from morpheyes_daemon.stereo.matching import MatchSettings, _forget_islands, _one_eyed, _runs, disparity_range, match
 from tests.panels import Panel, ideal_pair
 
 PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)
@@ -189,6 +189,23 @@ def test_the_number_of_threads_changes_not_a_bit(panel_before_wall):
         assert np.array_equal(results[0].disparity_px, other.disparity_px, equal_nan=True)
         assert np.array_equal(results[0].near, other.near)
         assert np.array_equal(results[0].one_eyed, other.one_eyed)
+
+
+def test_small_patches_in_the_unknown_are_forgotten_and_branches_are_not():
+    disparity = np.full((60, 80), np.nan, np.float32)
+    disparity[:, 50:] = 10.0
+    disparity[20:24, 20:26] = 30.0
+    disparity[:, 47:50] = 25.0
+    disparity[40:43, 60:66] = 40.0
+    _forget_islands(disparity, 200, 0.8)
+    assert np.isnan(disparity[20:24, 20:26]).all()
+    # the branch has unknown on its left only, the patch on the wall nowhere
+    assert (disparity[:, 47:50] == 25.0).all()
+    assert (disparity[40:43, 60:66] == 40.0).all()
+    large = np.full((60, 80), np.nan, np.float32)
+    large[10:40, 10:40] = 5.0
+    _forget_islands(large, 200, 0.8)
+    assert (large[10:40, 10:40] == 5.0).all()
 
 
 def slow_one_eyed(disparity, near, ceiling):
