@@ -1,0 +1,49 @@
+"""`morpheyes faults`: break everything that can break, in every state, and see how it ends."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    only: Annotated[str | None, typer.Option(help="Faults whose name begins like this; default: all.")] = None,
+    seeds: Annotated[str, typer.Option(help="Seeds, one or a range such as 0-2.")] = "0-2",
+    jobs: Annotated[int, typer.Option(min=1, help="Faults flown at the same time.")] = 2,
+    size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "320x240",
+    calibration: Annotated[str, typer.Option(help="'solved', 'exact', or a calibration file.")] = "exact",
+    out: Annotated[Path | None, typer.Option(help="Also write the table here, as docs/faults.md.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON and nothing else.")] = False,
+) -> None:
+    """Fly the fault matrix in the lockstep simulator.
+
+    Exit code 0 when every fault ended as the table says, 1 when one did not, 2 on wrong usage.
+    """
+    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.experiments.campaign import parse_seeds
+    from morpheyes_daemon.experiments.fault_report import page
+    from morpheyes_daemon.experiments.fault_run import Row, choose, flights, run_matrix
+    from morpheyes_daemon.experiments.plan import make_plan
+
+    faults, wanted = choose(only), parse_seeds(seeds)
+    total = flights(faults) * len(wanted)
+    done: list[Row] = []
+    with progress_line() as report:
+        plan = make_plan("forest", size=size, calibration=calibration, progress=report)
+
+        def show(row: Row) -> None:
+            done.append(row)
+            report(f"{row.fault}, {row.state}", len(done), total)
+            if not row.passed:
+                typer.echo(f"{row.fault} in {row.state}, seed {row.seed}: {'; '.join(row.complaints)}", err=True)
+
+        rows = run_matrix(plan, faults, wanted, jobs, show)
+    text = page(rows, wanted, f"--seeds {seeds} --size {size} --calibration {calibration}")
+    if out is not None:
+        out.write_text(text, encoding="utf-8")
+    typer.echo(json.dumps([row.as_json() for row in rows], indent=2) if as_json else text)
+    if not all(row.passed for row in rows):
+        raise typer.Exit(1)

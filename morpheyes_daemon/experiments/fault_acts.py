@@ -1,0 +1,301 @@
+"""What each fault of the matrix does to a simulated flight, and how it is mended where it is.
+
+One function per fault, each a few lines on the places where something can break (`FaultFlight`, `sabotage`, the
+twins' own fault hooks). What must follow stands in `faults.py`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import resource
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from morpheyes_daemon.experiments import sabotage
+from morpheyes_daemon.experiments.fault_flight import FaultFlight
+from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.teensy_twin import ServoFault
+from morpheyes_daemon.supervisor.worker import WorkerFailed, WorkerLost
+
+Act = Callable[[FaultFlight], None]
+
+WORKER_TIMEOUT_S = 1.0
+"""After this long the process worker kills a hung child; here the twin of that (supervisor.worker_process)."""
+
+FORGER = (42, 1)
+"""Somebody else's system id, with an autopilot's component id."""
+
+DISARM_AFTER_S = 0.4
+
+# -- camera -------------------------------------------------------------------------------------------------------
+
+
+def stall_camera(flight: FaultFlight) -> None:
+    flight.camera.stalled = True
+
+
+def restart_camera(flight: FaultFlight) -> None:
+    flight.camera.stalled = False
+
+
+def unplug_camera(flight: FaultFlight) -> None:
+    flight.camera.plugged = False
+
+
+def plug_camera_in(flight: FaultFlight) -> None:
+    flight.camera.plugged = True
+
+
+def retouch(retouched: Callable[[], sabotage.Retouch]) -> Act:
+    """Have every pair changed from now on."""
+
+    def act(flight: FaultFlight) -> None:
+        flight.camera.retouch = retouched()
+
+    return act
+
+
+def desynchronize(offset_ms: float) -> Act:
+    """The right eye exposes later by so much more."""
+
+    def act(flight: FaultFlight) -> None:
+        camera = flight.stage.camera
+        camera.sensor = replace(camera.sensor, sync_offset_s=camera.sensor.sync_offset_s + offset_ms / 1e3)
+
+    return act
+
+
+def burn_out(flight: FaultFlight) -> None:
+    camera = flight.stage.camera
+    camera.sensor = replace(camera.sensor, auto_exposure=False, exposure=40.0)
+
+
+# -- depth --------------------------------------------------------------------------------------------------------
+
+
+def slow_worker(flight: FaultFlight) -> None:
+    flight.worker.extra_ns = 1_000_000_000
+
+
+def hang_worker(flight: FaultFlight) -> None:
+    flight.worker.hung_s = WORKER_TIMEOUT_S
+
+
+def kill_worker(flight: FaultFlight) -> None:
+    flight.worker.gone = WorkerLost("The vision worker died (signal 9); a new one is being started.")
+
+
+def crash_pipeline(flight: FaultFlight) -> None:
+    flight.worker.gone = WorkerFailed("ValueError: something unforeseen")
+
+
+def mend_worker(flight: FaultFlight) -> None:
+    flight.worker.gone, flight.worker.hung_s, flight.worker.extra_ns = None, None, 0
+
+
+# -- servo --------------------------------------------------------------------------------------------------------
+
+
+def servo(fault: ServoFault) -> Act:
+    """One of the Teensy twin's own faults."""
+    return lambda flight: flight.stage.teensy.inject(fault)
+
+
+def reboot_servo(flight: FaultFlight) -> None:
+    flight.stage.teensy.reboot()
+
+
+# -- autopilot link -----------------------------------------------------------------------------------------------
+
+
+def lose_link(flight: FaultFlight) -> None:
+    flight.wire.incoming = flight.wire.outgoing = sabotage.lose
+
+
+def lose_downlink(flight: FaultFlight) -> None:
+    flight.wire.incoming = sabotage.lose
+
+
+def lose_uplink(flight: FaultFlight) -> None:
+    flight.wire.outgoing = sabotage.lose
+
+
+def mend_link(flight: FaultFlight) -> None:
+    flight.wire.incoming = flight.wire.outgoing = sabotage.pass_on
+
+
+def unplug_link(flight: FaultFlight) -> None:
+    flight.wire.unplug()
+
+
+def noisy_link(flight: FaultFlight) -> None:
+    flight.wire.incoming = sabotage.add_noise(flight.rng)
+
+
+def cutting_link(flight: FaultFlight) -> None:
+    flight.wire.incoming = sabotage.cut_short(flight.rng)
+
+
+def swapping_link(flight: FaultFlight) -> None:
+    flight.wire.incoming = sabotage.swap_neighbours()
+
+
+def doubling_link(flight: FaultFlight) -> None:
+    flight.wire.incoming = flight.wire.outgoing = sabotage.double
+
+
+def forge(flight: FaultFlight) -> None:
+    """Somebody else on the link says that the switch is off, the mode another and the motors stopped."""
+    stranger = mavlink.MAVLink(None, *FORGER)
+
+    def passage(data: bytes, deliver: Callable[[bytes], None]) -> None:
+        off = [1500] * 4 + [1000] * 14
+        for message in (
+            mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3),
+            mavlink.MAVLink_rc_channels_message(0, 16, *off, 200),
+        ):
+            deliver(bytes(message.pack(stranger)))
+        deliver(data)
+
+    flight.wire.incoming = passage
+
+
+def reboot_autopilot(flight: FaultFlight) -> None:
+    flight.stage.autopilot.reboot()
+
+
+def ignore_overrides(flight: FaultFlight) -> None:
+    flight.stage.autopilot.ignore_overrides()
+
+
+# -- vehicle and pilot --------------------------------------------------------------------------------------------
+
+
+def switch_mode(mode: Mode) -> Act:
+    """The pilot, or a failsafe, changes the flight mode."""
+
+    def act(flight: FaultFlight) -> None:
+        flight.stage.autopilot.set_mode(mode)
+
+    return act
+
+
+def switch_off(flight: FaultFlight) -> None:
+    flight.stage.radio.switch(on=False)
+
+
+def switch_on(flight: FaultFlight) -> None:
+    flight.stage.radio.switch(on=True)
+
+
+def disarm(flight: FaultFlight) -> None:
+    flight.stage.autopilot.disarm_in_flight()
+
+
+def lose_message(number: int) -> Act:
+    """One message of the autopilot no longer arrives."""
+
+    def passage(data: bytes, deliver: Callable[[bytes], None]) -> None:
+        if int.from_bytes(data[7:10], "little") != number:
+            deliver(data)
+
+    def act(flight: FaultFlight) -> None:
+        flight.wire.incoming = passage
+
+    return act
+
+
+lose_rc_channels = lose_message(mavlink.MAVLINK_MSG_ID_RC_CHANNELS)
+
+
+def disarm_without_radio(flight: FaultFlight) -> None:
+    """RC_CHANNELS stops, and a little later the motors do."""
+    lose_rc_channels(flight)
+    asyncio.get_running_loop().call_later(DISARM_AFTER_S, flight.stage.autopilot.disarm_in_flight)
+
+
+def upset_ekf(flight: FaultFlight) -> None:
+    flight.stage.autopilot.ekf_unhealthy()
+
+
+def lose_aiding(flight: FaultFlight) -> None:
+    flight.stage.autopilot.lose_flow()
+
+
+def drain_battery(flight: FaultFlight) -> None:
+    flight.stage.autopilot.battery_low(0.1)
+
+
+def lose_ground_station(flight: FaultFlight) -> None:
+    flight.crew_task.cancel()
+
+
+def lose_radio(flight: FaultFlight) -> None:
+    flight.stage.autopilot.lose_radio()
+
+
+# -- the daemon itself --------------------------------------------------------------------------------------------
+
+
+def block_loop(seconds: float) -> Act:
+    """A call does not return for a while."""
+    return lambda flight: flight.block_loop(seconds)
+
+
+def kill_task(name: str) -> Act:
+    """A task meets something unforeseen at its next turn."""
+
+    def act(flight: FaultFlight) -> None:
+        pulse = flight.daemon.supervisor.pulses[name]
+
+        def fail() -> None:
+            pulse.on_first = None
+            raise RuntimeError("something unforeseen")
+
+        pulse.on_first = fail
+
+    return act
+
+
+def starve(flight: FaultFlight) -> None:
+    """The kernel takes the largest process, the worker, and the daemon waits for its pages."""
+    kill_worker(flight)
+    flight.block_loop(0.3)
+
+
+def fill_disk(flight: FaultFlight) -> None:
+    """The log cannot grow by a byte."""
+    size = flight.recorder.path.stat().st_size
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+
+def remove_log_device(flight: FaultFlight) -> None:
+    """The log's file and folder go away under the recorder."""
+    path = flight.recorder.path
+    for descriptor in os.listdir("/proc/self/fd"):
+        if os.path.realpath(f"/proc/self/fd/{descriptor}") == str(path.resolve()):
+            os.close(int(descriptor))
+    path.unlink()
+
+
+def step_wall_clock(flight: FaultFlight) -> None:
+    """The wall clock is set to 1970; only this process sees it."""
+    sys.modules["time"].time = lambda: 0.0  # type: ignore[attr-defined]
+
+
+def terminate(flight: FaultFlight) -> None:
+    flight.stop.set()
+
+
+def die(flight: FaultFlight) -> None:
+    flight.die()
+
+
+def die_and_restart(flight: FaultFlight) -> None:
+    """SIGKILL, and systemd starts it again a second later."""
+    flight.die()
+    asyncio.get_running_loop().call_later(1.0, flight.restart)

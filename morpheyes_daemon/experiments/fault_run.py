@@ -1,0 +1,204 @@
+"""Flies the fault matrix: one simulated flight per state and seed, forked at the moment of the fault.
+
+All faults of a state share the way into it; each then goes on in a process of its own (fork), so that a row costs
+only the seconds after its fault. Rows are independent of each other and of the number of jobs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+import tempfile
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from morpheyes_daemon.clock import run_virtual
+from morpheyes_daemon.errors import CalibrationError, UsageError
+from morpheyes_daemon.experiments.fault_flight import FaultFlight, Measured
+from morpheyes_daemon.experiments.faults import FAULTS, REACTION_S, RELEASE_S, Ending, Fault, complaints
+from morpheyes_daemon.experiments.flight import FlightPlan
+from morpheyes_daemon.experiments.plan import with_seed
+from morpheyes_daemon.safety.states import State
+
+STATES = (State.PREFLIGHT, State.STANDBY, State.ENGAGED, State.BRAKING, State.HOLD)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One fault in one state at one seed: what was measured and what was wrong with it (empty: nothing)."""
+
+    fault: str
+    kind: str
+    state: str
+    seed: int
+    ending: str
+    allowed_s: float
+    ended: str
+    reason: str
+    reaction_s: float | None
+    release_s: float | None
+    stop_m: float | None
+    reserved_m: float | None
+    clearance_m: float | None
+    complaints: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """It ended as the table says."""
+        return not self.complaints
+
+    def as_json(self) -> dict[str, Any]:
+        """Return plain values, `passed` among them."""
+        return {**asdict(self), "passed": self.passed}
+
+
+def choose(only: str | None) -> tuple[Fault, ...]:
+    """Return the faults whose name is, or begins with, `only`; all for None. Raises UsageError."""
+    chosen = tuple(fault for fault in FAULTS if only is None or fault.name.startswith(only))
+    if not chosen:
+        raise UsageError(f"there is no fault {only!r}; there are: {', '.join(fault.name for fault in FAULTS)}.")
+    return chosen
+
+
+def flights(faults: tuple[Fault, ...]) -> int:
+    """Return how many flights one seed takes."""
+    return sum(len(fault.endings) for fault in faults)
+
+
+def run_matrix(
+    plan: FlightPlan, faults: tuple[Fault, ...], seeds: tuple[int, ...], jobs: int, done: Callable[[Row], None]
+) -> list[Row]:
+    """Fly every fault in every state that it can happen in, at every seed; `done` hears of each row."""
+    cv2.setNumThreads(1)  # a pool of threads would not survive the fork
+    watched = plan.config.autopilot.model_copy(update={"watch_gcs": True})
+    plan = replace(plan, config=plan.config.model_copy(update={"autopilot": watched}))
+    rows: list[Row] = []
+    for seed in seeds:
+        seeded = with_seed(plan, seed)
+        for fault in faults:
+            if fault.rig_seed != 0:
+                rows += _fly_alone(seeded, fault, done)
+        for state in STATES:
+            shared = [fault for fault in faults if fault.rig_seed == 0 and state in fault.endings]
+            if shared:
+                rows += run_virtual(_fly_state(seeded, state, shared, jobs, done))
+    order = {fault.name: number for number, fault in enumerate(FAULTS)}
+    return sorted(rows, key=lambda row: (order[row.fault], STATES.index(State(row.state)), row.seed))
+
+
+def _fly_alone(plan: FlightPlan, fault: Fault, done: Callable[[Row], None]) -> list[Row]:
+    """A fault that is there before the daemon starts: its calibration."""
+    if fault.rig_seed is None:
+        plan = replace(plan, calibration=plan.calibration.with_name("missing.yaml"))
+    else:
+        plan = replace(plan, scenario=replace(plan.scenario, rig_seed=fault.rig_seed))
+    try:
+        return run_virtual(_fly_state(plan, State.PREFLIGHT, [fault], 1, done))
+    except CalibrationError as error:
+        refused = fault.endings[State.PREFLIGHT] is Ending.REFUSES
+        row = make_row(fault, State.PREFLIGHT, plan.scenario.seed, None, () if refused else (str(error),))
+        done(row)
+        return [row]
+
+
+async def _fly_state(
+    plan: FlightPlan, state: State, faults: list[Fault], jobs: int, done: Callable[[Row], None]
+) -> list[Row]:
+    running: deque[_Branch] = deque()
+    rows: list[Row] = []
+
+    def collect() -> None:
+        rows.append(running.popleft().row())
+        done(rows[-1])
+
+    with tempfile.TemporaryDirectory() as folder:
+        async with FaultFlight(plan, Path(folder)) as flight:
+            await flight.reach(state)
+            for fault in faults:
+                if len(running) == jobs:
+                    collect()
+                running.append(await _branch(flight, state, fault))
+            while running:
+                collect()
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class _Branch:
+    """A child in which one fault takes its course."""
+
+    fault: Fault
+    state: State
+    seed: int
+    pid: int
+    answer: int
+
+    def row(self) -> Row:
+        """Wait for the child and return what it saw."""
+        with os.fdopen(self.answer, encoding="utf-8") as file:
+            text = file.read()
+        os.waitpid(self.pid, 0)
+        if not text:
+            return make_row(self.fault, self.state, self.seed, None, ("the simulation died",))
+        return Row(**{**json.loads(text), "complaints": tuple(json.loads(text)["complaints"])})
+
+
+async def _branch(flight: FaultFlight, state: State, fault: Fault) -> _Branch:
+    """Fork; the parent returns at once and stands still, the child breaks something and never returns."""
+    seed = flight.plan.scenario.seed
+    loop = asyncio.get_running_loop()
+    answer, writer = os.pipe()
+    pid = os.fork()
+    if pid:
+        os.close(writer)
+        return _Branch(fault, state, seed, pid, answer)
+    asyncio._set_running_loop(loop)  # asyncio remembers in which process its loop runs
+    try:
+        row = await _try(flight, state, fault)
+    except Exception as error:  # noqa: BLE001 -- the whole life of a process
+        row = make_row(fault, state, seed, None, (f"{type(error).__name__}: {error}",))
+    os.write(writer, json.dumps(asdict(row)).encode())
+    os._exit(0)
+
+
+async def _try(flight: FaultFlight, state: State, fault: Fault) -> Row:
+    loop = asyncio.get_running_loop()
+    watching = asyncio.create_task(flight.measure(fault.watch_s))
+    await asyncio.sleep(0)
+    fault.begin(flight)
+    if fault.lasts_s is not None:
+        loop.call_later(fault.lasts_s, fault.end, flight)
+    seen = await watching
+    return make_row(fault, state, flight.plan.scenario.seed, seen, tuple(complaints(fault, state, seen)))
+
+
+def make_row(fault: Fault, state: State, seed: int, seen: Measured | None, wrong: tuple[str, ...]) -> Row:
+    """Return the row of one fault; `seen` is None when no flight came of it."""
+    in_flight = seen is not None and state is State.ENGAGED
+    return Row(
+        fault=fault.name,
+        kind=fault.kind,
+        state=state,
+        seed=seed,
+        ending=fault.endings[state],
+        allowed_s=round(fault.notice_s + (RELEASE_S if fault.endings[state] is Ending.RELEASES else REACTION_S), 3),
+        ended=seen.state if seen else "",
+        reason=seen.reason if seen else "",
+        reaction_s=_rounded(seen.reaction_s if seen and in_flight else None),
+        release_s=_rounded(seen.release_s if seen else None),
+        stop_m=_rounded(seen.stop_m if seen and in_flight else None),
+        reserved_m=_rounded(seen.reserved_m if seen and in_flight else None),
+        clearance_m=_rounded(seen.clearance_m if seen else None),
+        complaints=wrong,
+    )
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(value, 3)

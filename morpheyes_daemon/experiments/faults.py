@@ -1,0 +1,368 @@
+"""The fault matrix: what can break, in which state, and how each must end. A table, and the rule for each ending.
+
+Class A: the daemon lives and must act within 250 ms of noticing. Class B: it is dead or cut off, the autopilot's own
+time-out acts, and the vehicle must stop within what the governor had kept free. `fault_run` flies the table,
+`fault_acts` says what each fault does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from morpheyes_daemon.experiments import fault_acts as acts
+from morpheyes_daemon.experiments import sabotage
+from morpheyes_daemon.experiments.fault_flight import Measured, Sent
+from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.teensy_twin import ServoFault
+
+REACTION_S = 0.25
+"""From noticing to neutral sticks on the wire."""
+
+RELEASE_S = 0.05
+"""From the pilot's message to the release."""
+
+FRAME_S, DEPTH_S, LINK_S, VEHICLE_S, SWITCH_S = 0.6, 0.7, 0.5, 0.3, 0.5
+"""Declared times to notice: three camera periods, the same and the matcher's latency, and the time-outs."""
+
+HEARTBEAT_S, RC_S, STATUS_S, PICTURE_S = 0.1, 0.05, 0.5, 0.3
+"""Periods of the messages, and of a picture with its matching."""
+
+STILL_S = 0.1
+"""A stream whose last message is older than this has ended."""
+
+
+class Ending(StrEnum):
+    """How a fault in a state must end; `complaints` checks each."""
+
+    FLIES = "flies on"
+    RESUMES = "neutral, then flies on"
+    HOLDS = "neutral until the pilot acts"
+    RELEASES = "released at once"
+    LETS_GO = "neutral, then released"
+    READY = "stays ready, sends nothing"
+    UNREADY = "is not ready, sends nothing"
+    STOPS = "the autopilot stops it"
+    REFUSES = "the daemon does not start"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One row: `begin` breaks something, `end` mends it after `lasts_s`. `notice_s` is the declared detection time.
+
+    `watch_s` is how long to look on; `falls`: the motors stop, so that hitting something says nothing. `rig_seed`
+    flies another rig than the one that was calibrated, None the calibration missing.
+    """
+
+    name: str
+    what: str
+    notice_s: float
+    endings: Mapping[State, Ending]
+    begin: acts.Act = lambda flight: None
+    end: acts.Act = lambda flight: None
+    lasts_s: float | None = None
+    watch_s: float = 7.0
+    falls: bool = False
+    rig_seed: int | None = 0
+
+    @property
+    def kind(self) -> str:
+        """A: the daemon lives. B: it is dead or cut off."""
+        return "B" if Ending.STOPS in self.endings.values() else "A"
+
+
+E = Ending
+_AIR = (State.ENGAGED, State.BRAKING, State.HOLD, State.STANDBY)
+
+
+def _row(*endings: Ending | None, ground: Ending | None = None) -> Mapping[State, Ending]:
+    """Endings in ENGAGED, BRAKING, HOLD and STANDBY, and on the ground; None: cannot happen there, or is no news."""
+    pairs = zip((*_AIR, State.PREFLIGHT), (*endings, ground), strict=True)
+    return {state: ending for state, ending in pairs if ending is not None}
+
+
+_STOPPED = _row(E.HOLDS, E.HOLDS, E.HOLDS, E.UNREADY)
+_STOPPED_THEN_WELL = _row(E.HOLDS, E.HOLDS, E.HOLDS, E.READY)
+_BLIP = _row(E.RESUMES, None, E.HOLDS, E.READY)
+_HARMLESS = _row(E.FLIES, E.RESUMES, E.HOLDS, E.READY)
+_TAKEN = _row(E.RELEASES, E.RELEASES, E.RELEASES, None)
+_LEFT = _row(E.LETS_GO, E.LETS_GO, E.LETS_GO, E.UNREADY)
+_DEAD = _row(E.STOPS, E.STOPS, E.STOPS, E.UNREADY)
+
+FAULTS: tuple[Fault, ...] = (
+    Fault("nothing", "control: nothing breaks", 0.0, _row(E.FLIES, E.RESUMES, E.HOLDS, E.READY, ground=E.READY)),
+    # camera
+    Fault("camera-stall", "the camera stalls", FRAME_S, _STOPPED, acts.stall_camera),
+    Fault("camera-blip", "the camera stalls for 1 s", FRAME_S, _BLIP, acts.stall_camera, acts.restart_camera, 1.0),
+    Fault(
+        "camera-unplugged",
+        "the camera is unplugged",
+        FRAME_S,
+        _row(E.HOLDS, E.HOLDS, E.HOLDS, E.UNREADY, ground=E.UNREADY),
+        acts.unplug_camera,
+    ),
+    Fault(
+        "camera-replugged",
+        "the camera is unplugged for 0.5 s",
+        FRAME_S,
+        _STOPPED_THEN_WELL,
+        acts.unplug_camera,
+        acts.plug_camera_in,
+        0.5,
+    ),
+    Fault(
+        "image-frozen",
+        "the same picture for ever",
+        DEPTH_S + PICTURE_S,
+        _STOPPED,
+        acts.retouch(sabotage.frozen_picture),
+    ),
+    Fault(
+        "eyes-swapped",
+        "left and right exchanged",
+        DEPTH_S + PICTURE_S,
+        _STOPPED,
+        acts.retouch(lambda: sabotage.swapped_eyes),
+    ),
+    Fault(
+        "eye-black",
+        "the right eye sees nothing",
+        DEPTH_S + PICTURE_S,
+        _STOPPED,
+        acts.retouch(lambda: sabotage.black_eye),
+    ),
+    Fault("image-burnt", "exposure burnt out", DEPTH_S + PICTURE_S, _STOPPED, acts.burn_out),
+    Fault("desync-5ms", "the right eye 5 ms late", DEPTH_S, _HARMLESS, acts.desynchronize(5.0)),
+    Fault("desync-20ms", "the right eye 20 ms late", DEPTH_S, _HARMLESS, acts.desynchronize(20.0)),
+    Fault("desync-50ms", "the right eye 50 ms late", DEPTH_S, _STOPPED, acts.desynchronize(50.0)),
+    # depth
+    Fault("depth-slow", "each depth map 1 s late", DEPTH_S, _STOPPED, acts.slow_worker),
+    Fault("depth-hung", "the matcher hangs until it is killed", DEPTH_S, _STOPPED, acts.hang_worker),
+    Fault(
+        "depth-killed",
+        "the matcher is killed and started again",
+        PICTURE_S,
+        _STOPPED_THEN_WELL,
+        acts.kill_worker,
+        acts.mend_worker,
+        0.3,
+    ),
+    Fault("depth-crashing", "the matcher raises at every frame", PICTURE_S, _STOPPED, acts.crash_pipeline),
+    # calibration
+    Fault("calibration-missing", "no calibration file", 0.0, _row(*[None] * 4, ground=E.REFUSES), rig_seed=None),
+    Fault(
+        "calibration-other",
+        "calibration of another rig",
+        0.0,
+        _row(*[None] * 4, ground=E.UNREADY),
+        rig_seed=3,
+        watch_s=12.0,
+    ),
+    # servo
+    Fault("servo-stuck", "the servos stick, targets are acknowledged", 0.0, _HARMLESS, acts.servo(ServoFault.STUCK)),
+    Fault(
+        "servo-silent",
+        "the Teensy is silent",
+        1.5,
+        _row(E.HOLDS, E.HOLDS, E.HOLDS, E.UNREADY, ground=E.UNREADY),
+        acts.servo(ServoFault.SILENT),
+    ),
+    Fault("servo-garbage", "the Teensy sends garbage", 1.5, _STOPPED, acts.servo(ServoFault.GARBAGE)),
+    Fault("servo-reboot", "the Teensy restarts", 0.7, _STOPPED_THEN_WELL, acts.reboot_servo),
+    Fault("servo-wrong", "the servos go 10 mm too far", 0.0, _HARMLESS, acts.servo(ServoFault.WRONG_POSITION)),
+    # link
+    Fault("link-lost", "both directions silent", VEHICLE_S, _DEAD, acts.lose_link),
+    Fault("link-unplugged", "the port goes away", VEHICLE_S, _DEAD, acts.unplug_link),
+    Fault(
+        "uplink-lost",
+        "the autopilot no longer hears the daemon",
+        0.0,
+        _row(E.STOPS, E.STOPS, E.STOPS, E.READY),
+        acts.lose_uplink,
+    ),
+    Fault("downlink-lost", "the daemon no longer hears the autopilot", VEHICLE_S, _LEFT, acts.lose_downlink),
+    Fault(
+        "link-gap",
+        "both directions silent for 1 s",
+        VEHICLE_S,
+        _STOPPED_THEN_WELL,
+        acts.lose_link,
+        acts.mend_link,
+        1.0,
+    ),
+    Fault("link-blip", "both directions silent for 0.2 s", 0.0, _HARMLESS, acts.lose_link, acts.mend_link, 0.2),
+    Fault("link-garbage", "random bytes between the messages", 0.0, _HARMLESS, acts.noisy_link),
+    Fault("link-truncated", "every fifth message cut short", 0.0, _HARMLESS, acts.cutting_link),
+    Fault("link-reordered", "messages overtake each other", 0.0, _HARMLESS, acts.swapping_link),
+    Fault("link-doubled", "every message twice, both ways", 0.0, _HARMLESS, acts.doubling_link),
+    Fault("forged-sender", "a stranger says: switch off, disarmed", 0.0, _HARMLESS, acts.forge),
+    Fault(
+        "autopilot-reboot", "the autopilot restarts, motors stop", VEHICLE_S, _LEFT, acts.reboot_autopilot, falls=True
+    ),
+    Fault(
+        "overrides-ignored",
+        "the autopilot ignores the sticks",
+        1.5,
+        _row(E.HOLDS, E.HOLDS, E.HOLDS, E.READY),
+        acts.ignore_overrides,
+    ),
+    # pilot and vehicle
+    Fault("pilot-mode", "the pilot switches to ALT_HOLD", HEARTBEAT_S, _TAKEN, acts.switch_mode(Mode.ALT_HOLD)),
+    Fault("failsafe-mode", "a failsafe switches to LAND", HEARTBEAT_S, _TAKEN, acts.switch_mode(Mode.LAND)),
+    Fault("switch-off", "the pilot flips the switch", RC_S + 0.02, _TAKEN, acts.switch_off),
+    Fault("switch-stuck-on", "the switch is on at boot", 0.0, _row(*[None] * 4, ground=E.UNREADY), acts.switch_on),
+    Fault("disarm", "the motors are stopped in flight", HEARTBEAT_S, _TAKEN, acts.disarm, falls=True),
+    Fault(
+        "disarm-rc-silent",
+        "RC_CHANNELS stops, then the motors",
+        acts.DISARM_AFTER_S + HEARTBEAT_S,
+        _TAKEN,
+        acts.disarm_without_radio,
+        falls=True,
+    ),
+    Fault("rc-channels-lost", "RC_CHANNELS no longer comes", SWITCH_S, _STOPPED, acts.lose_rc_channels),
+    Fault(
+        "ekf-unhealthy",
+        "the EKF's variances rise",
+        1.2,
+        _row(E.RELEASES, E.RELEASES, E.RELEASES, E.UNREADY),
+        acts.upset_ekf,
+    ),
+    Fault("aiding-lost", "GPS or optical flow is lost", 6.0, _LEFT, acts.lose_aiding, watch_s=12.0),
+    Fault("battery-low", "10 % of charge left", STATUS_S, _STOPPED, acts.drain_battery),
+    Fault(
+        "gcs-lost",
+        "the ground station's heartbeat is gone (watched)",
+        5.0,
+        _STOPPED,
+        acts.lose_ground_station,
+        watch_s=11.0,
+    ),
+    Fault("rc-lost", "the pilot's radio is gone", RC_S + 0.02, _LEFT, acts.lose_radio),
+    # the daemon
+    Fault("loop-300ms", "the event loop is held up for 0.3 s", 0.3, _BLIP, acts.block_loop(0.3)),
+    Fault("loop-900ms", "the event loop is held up for 0.9 s", 0.9, _STOPPED_THEN_WELL, acts.block_loop(0.9)),
+    Fault("task-mission", "the mission task dies", PICTURE_S, _STOPPED_THEN_WELL, acts.kill_task("mission")),
+    Fault("task-sticks", "the stick task dies", 0.02, _STOPPED_THEN_WELL, acts.kill_task("sticks")),
+    Fault("task-capture", "the capture task dies", PICTURE_S, _STOPPED_THEN_WELL, acts.kill_task("capture")),
+    Fault("task-baseline", "the baseline task dies", 0.1, _STOPPED_THEN_WELL, acts.kill_task("baseline")),
+    Fault("clock-step", "the wall clock is set back", 0.0, _HARMLESS, acts.step_wall_clock),
+    Fault("memory-pressure", "the kernel kills the matcher, all else waits 0.3 s", 0.6, _STOPPED, acts.starve),
+    Fault("disk-full", "the log cannot grow", 0.0, _HARMLESS, acts.fill_disk),
+    Fault("log-gone", "the log's device goes away", 0.0, _HARMLESS, acts.remove_log_device),
+    Fault("sigterm", "systemd stops the daemon", 0.0, _LEFT, acts.terminate),
+    Fault("sigkill", "the daemon is killed and started again", 0.0, _DEAD, acts.die_and_restart),
+    Fault("power-cut", "the companion computer loses power", 0.0, _DEAD, acts.die),
+)
+"""Every fault; the states of each are the keys of its endings."""
+
+
+def complaints(fault: Fault, state: State, seen: Measured) -> list[str]:
+    """Return what did not end as the table says; empty when all did."""
+    found = list(_RULES[fault.endings[state]](fault, state, seen))
+    if seen.clearance_m < 0.0 and not fault.falls:
+        found.append(f"hit an obstacle ({seen.clearance_m:.2f} m)")
+    return found
+
+
+Complaints = Iterator[str]
+_Rule = Callable[[Fault, State, Measured], Complaints]
+
+
+def _expect(holds: bool, complaint: str) -> Complaints:
+    if not holds:
+        yield complaint
+
+
+def _in(seen: Measured, *states: State) -> Complaints:
+    yield from _expect(seen.state in states, f"ended in {seen.state} ({seen.reason})")
+
+
+def _reacted(fault: Fault, state: State, seen: Measured) -> Complaints:
+    """Neutral in time; where the sticks were neutral already, they stay so."""
+    limit_s = fault.notice_s + REACTION_S
+    if state is State.ENGAGED:
+        in_time = seen.reaction_s is not None and seen.reaction_s <= limit_s
+        yield from _expect(in_time, f"neutral after {seen.reaction_s} s, allowed {limit_s:.2f} s")
+
+
+def _silent(seen: Measured) -> Complaints:
+    yield from _expect(seen.neutrals == 0 and seen.last in (None, Sent.RELEASE), "moved sticks that are not ours")
+
+
+def _flies(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _in(seen, State.ENGAGED)
+    yield from _expect(seen.last is Sent.STICKS, "does not fly")
+    yield from _expect(seen.neutrals <= 2, f"braked ({seen.neutrals} neutral messages)")
+
+
+def _resumes(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _reacted(fault, state, seen)
+    yield from _in(seen, State.ENGAGED)
+    yield from _expect(seen.sticks_after > 0, "never flew on")
+
+
+def _holds(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _reacted(fault, state, seen)
+    yield from _in(seen, State.HOLD)
+    yield from _expect(seen.sticks_after == 0, "sticks after neutral")
+    still = seen.last is Sent.NEUTRAL and seen.last_s is not None and seen.last_s > fault.watch_s - STILL_S
+    yield from _expect(still, "does not hold the sticks neutral")
+    yield from _expect(seen.stopped, "still moves")
+
+
+def _releases(fault: Fault, state: State, seen: Measured) -> Complaints:
+    limit_s = fault.notice_s + RELEASE_S
+    yield from _in(seen, State.PILOT, State.RELEASED)
+    in_time = seen.release_s is not None and seen.release_s <= limit_s
+    yield from _expect(in_time, f"released after {seen.release_s} s, allowed {limit_s:.2f} s")
+    yield from _gone(seen)
+
+
+def _gone(seen: Measured) -> Complaints:
+    yield from _expect(seen.last is Sent.RELEASE, f"the last message was {seen.last}")
+    yield from _expect(seen.sticks_after == 0, "sticks afterwards")
+
+
+def _lets_go(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _reacted(fault, state, seen)
+    yield from _in(seen, State.PILOT, State.RELEASED)
+    yield from _expect(seen.neutrals > 0, "no neutral before the release")
+    yield from _gone(seen)
+
+
+def _ready(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _in(seen, State.STANDBY)
+    yield from _silent(seen)
+
+
+def _unready(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _expect(seen.state not in (State.STANDBY, State.ENGAGED), f"is ready ({seen.state})")
+    yield from _silent(seen)
+
+
+def _stops(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _expect(seen.stopped, "still moves")
+    yield from _expect(
+        seen.stop_m <= seen.reserved_m, f"stopped after {seen.stop_m:.2f} m of {seen.reserved_m:.2f} m"
+    )
+    yield from _expect(seen.sticks_after == 0, "sticks afterwards")
+
+
+def _refuses(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield "the daemon started"
+
+
+_RULES: dict[Ending, _Rule] = {
+    Ending.FLIES: _flies,
+    Ending.RESUMES: _resumes,
+    Ending.HOLDS: _holds,
+    Ending.RELEASES: _releases,
+    Ending.LETS_GO: _lets_go,
+    Ending.READY: _ready,
+    Ending.UNREADY: _unready,
+    Ending.STOPS: _stops,
+    Ending.REFUSES: _refuses,
+}
