@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morpheyes_daemon.config import Footprint, Mount
 from morpheyes_daemon.simulation.convex import BOX, CYLINDER, ELLIPSOID, FRUSTUM, PRISM, nearest
@@ -18,6 +17,7 @@ from morpheyes_daemon.simulation.meshes import icosphere
 from morpheyes_daemon.simulation.rig_twin import T_frd_rig
 from morpheyes_daemon.transforms import Array, pose
 
+SIZE = 9
 _DIRECTIONS = np.ascontiguousarray(icosphere(2)[0])
 
 
@@ -32,11 +32,15 @@ class Solid:
     @property
     def capsule(self) -> tuple[float, ...]:
         """Ends of an axis (world frame) and a radius that enclose it."""
-        x, y, z = self._extent()
-        radius, half = float(np.hypot(x, y)) if self.kind in (BOX, PRISM) else max(x, y), z
-        if self.kind == ELLIPSOID:
-            radius, half = max(x, y, z), 0.0
-        end = half * self.T[:3, 2]
+        extent = np.array(self._extent())
+        if self.kind in (BOX, PRISM):
+            axis = int(np.argmax(extent))
+            radius, half = float(np.linalg.norm(np.delete(extent, axis))), float(extent[axis])
+        elif self.kind == ELLIPSOID:
+            axis, radius, half = 2, float(extent.max()), 0.0
+        else:
+            axis, radius, half = 2, float(extent[:2].max()), float(extent[2])
+        end = half * self.T[:3, axis]
         return (*(self.T[:3, 3] - end), *(self.T[:3, 3] + end), radius)
 
     def _extent(self) -> tuple[float, float, float]:
@@ -44,7 +48,7 @@ class Solid:
         if self.kind == FRUSTUM:
             return max(size[:2]), max(size[:2]), size[2]
         if self.kind == PRISM:
-            return max(abs(c) for c in size[0:6:2]), max(abs(c) for c in size[1:6:2]), size[6]
+            return max(abs(c) for c in size[0:8:2]), max(abs(c) for c in size[1:8:2]), size[8]
         return size[0], size[1], size[2]
 
 
@@ -66,6 +70,14 @@ def box_solid(T: Array, edges_m: tuple[float, float, float]) -> Solid:
     return Solid(BOX, T, (edges_m[0] / 2, edges_m[1] / 2, edges_m[2] / 2))
 
 
+def prism_solid(T: Array, corners_m: Array, thickness_m: float) -> Solid:
+    """Return a convex quadrilateral, or a triangle, (4 or 3, 2) in the xy plane of pose T, thickened along z."""
+    middle = 0.5 * (corners_m.min(axis=0) + corners_m.max(axis=0))
+    moved = T @ pose(np.eye(3), np.array([*middle, 0.0]))
+    corners = (corners_m - middle)[[0, 1, 2, -1]]
+    return Solid(PRISM, moved, (*corners.ravel().tolist(), thickness_m / 2))
+
+
 def _frame_along(z: Array) -> Array:
     x = np.cross(z, [1.0, 0.0, 0.0] if abs(z[0]) < 0.9 else [0.0, 1.0, 0.0])
     x /= np.linalg.norm(x)
@@ -79,14 +91,14 @@ class Obstacles:
         n = len(solids)
         self._kinds = np.array([s.kind for s in solids], np.int64)
         self._frames = np.array([s.T[:3] for s in solids], np.float64).reshape(n, 3, 4)
-        self._sizes = np.zeros((n, 7))
+        self._sizes = np.zeros((n, SIZE))
         for i, solid in enumerate(solids):
             self._sizes[i, : len(solid.size)] = solid.size
         self._capsules = np.array([s.capsule for s in solids], np.float64).reshape(n, 7)
 
     def nearest_m(self, body: Solid, limit_m: float = np.inf) -> float:
         """Return the signed distance from `body` to the nearest solid, or `limit_m` if all are farther."""
-        size = np.zeros(7)
+        size = np.zeros(SIZE)
         size[: len(body.size)] = body.size
         reach = float(np.linalg.norm(body._extent()))
         found = nearest(
@@ -143,8 +155,3 @@ class CollisionWorld:
                 T_object_ned = np.linalg.inv(group.T_ned_object(t_s))
                 best = group.obstacles.nearest_m(Solid(body.kind, T_object_ned @ body.T, body.size), best)
         return best
-
-
-def prism_solid(T: Array, corners_m: NDArray[np.float64], thickness_m: float) -> Solid:
-    """Return a triangle (3, 2) in the xy plane of pose T, thickened along z."""
-    return Solid(PRISM, T, (*corners_m.ravel().tolist(), thickness_m / 2))

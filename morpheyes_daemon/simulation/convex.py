@@ -15,10 +15,10 @@ import numpy as np
 from morpheyes_daemon.simulation.kernel import allocating
 
 FRUSTUM, CYLINDER, ELLIPSOID, BOX, PRISM = range(5)
-"""Kinds of solid; what `size` (7,) means in the solid's own frame, centred at the origin:
+"""Kinds of solid; what `size` (9,) means in the solid's own frame, centred at the origin:
 
 FRUSTUM radius at -z, radius at +z, half height; CYLINDER (elliptic) half axes x, y, half height; ELLIPSOID half axes;
-BOX half edges; PRISM three corners x, y of a triangle, half thickness along z.
+BOX half edges; PRISM four corners x, y of a convex quadrilateral (two may coincide), half thickness along z.
 """
 
 TOLERANCE_M = 2e-5
@@ -48,10 +48,10 @@ def _support_local(kind: int, size: Any, x: float, y: float, z: float) -> tuple[
     if kind == BOX:
         return math.copysign(size[0], x), math.copysign(size[1], y), math.copysign(size[2], z)
     best = 0
-    for k in range(1, 3):
+    for k in range(1, 4):
         if size[2 * k] * x + size[2 * k + 1] * y > size[2 * best] * x + size[2 * best + 1] * y:
             best = k
-    return size[2 * best], size[2 * best + 1], math.copysign(size[6], z)
+    return size[2 * best], size[2 * best + 1], math.copysign(size[8], z)
 
 
 @allocating
@@ -160,7 +160,7 @@ def _overlap(
 def distance(
     kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: Any, size_b: Any, directions: Any
 ) -> float:
-    """Return the signed distance between two solids: kind, frame (3, 4) as rotation and centre, size (7,).
+    """Return the signed distance between two solids: kind, frame (3, 4) as rotation and centre, size (9,).
 
     `directions` (n, 3) are unit vectors along which an overlap is measured.
     """

@@ -17,11 +17,17 @@ from pydantic import Field, model_validator
 
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.simulation import meshes, textures
-from morpheyes_daemon.simulation.scene import GROUND_OBJECT, SKY_OBJECT, Bgr, Light, Material, Mesh, Scene
+from morpheyes_daemon.simulation.collision import Solid, ellipsoid_solid, frustum_solid
+from morpheyes_daemon.simulation.contents import Contents, Disc
+from morpheyes_daemon.simulation.scene import GROUND_OBJECT, Bgr, Light, Material, Mesh
 from morpheyes_daemon.simulation.species import BROADLEAVES, CONIFERS, Layer, Species, broadleaf, conifer
 from morpheyes_daemon.transforms import Array
 
 LIGHT_MAP_PX = 2048
+
+MAP_HEIGHT_M = 1.5
+"""Height at which trunks are drawn on maps."""
+
 FAR_GROUND_M = 110.0
 """The ground goes on this far past the trees; from there on the woods of the sky take over."""
 
@@ -80,6 +86,11 @@ class Tree:
         """Return the trunk's radius at a height above its base."""
         return self.radius_m + height_m / self.height_m * (self.top_radius_m - self.radius_m)
 
+    def disc_at(self, height_m: float) -> Disc:
+        """Return the trunk's section at a height."""
+        middle = self.base + height_m / self.height_m * (self.top - self.base)
+        return Disc(float(middle[0]), float(middle[1]), self.radius_at_m(height_m))
+
     def placed(self, unit: Array) -> Array:
         """Return unit-space points (n, 3) of the species in ned: turned, widened, carried along the trunk."""
         c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
@@ -93,7 +104,11 @@ class Tree:
         return list(zip(centres, radii, strict=True))
 
 
-def plant(world: ForestWorld, seed: int) -> list[Tree]:
+Glades = tuple[tuple[float, float, float], ...]
+"""Places kept free of trees: x, y, radius in metres."""
+
+
+def plant(world: ForestWorld, seed: int, glades: Glades = ()) -> list[Tree]:
     """Place the trees one after the other where they keep `gap_m` to those that stand already."""
     rng = np.random.default_rng([seed, 100])
     x_low, x_high = -world.run_in_m, world.course_m + world.run_out_m
@@ -101,6 +116,7 @@ def plant(world: ForestWorld, seed: int) -> list[Tree]:
     lean_rad = math.radians(world.max_lean_deg)
     # leaning trunks keep the gap up to 3 m above the ground
     gap = world.gap_m + 2 * 3.0 * math.tan(lean_rad)
+    kept = [(0.0, 0.0, world.clearing_m), (world.course_m, 0.0, world.clearing_m), *glades]
     places = np.empty((wanted, 3))
     trees: list[Tree] = []
     for _ in range(100 * wanted):
@@ -110,8 +126,7 @@ def plant(world: ForestWorld, seed: int) -> list[Tree]:
         radius = rng.uniform(world.radius_min_m, world.radius_max_m)
         distance = np.hypot(places[: len(trees), 0] - x, places[: len(trees), 1] - y)
         free = bool(np.all(distance - places[: len(trees), 2] - radius >= gap))
-        from_ends = min(math.hypot(x, y), math.hypot(x - world.course_m, y)) - radius
-        if free and from_ends >= world.clearing_m:
+        if free and all(math.hypot(x - gx, y - gy) - radius >= r for gx, gy, r in kept):
             places[len(trees)] = x, y, radius
             trees.append(_grow(rng, world, x, y, radius, lean_rad))
     return trees
@@ -138,39 +153,27 @@ def _leaf_green(rng: np.random.Generator) -> Array:
     return np.asarray(np.array([0.75, 1.0, 0.95]) * rng.uniform(0.7, 1.25, 3) * rng.uniform(0.8, 1.2))
 
 
-def build_scene(world: ForestWorld, seed: int) -> tuple[Scene, list[Tree]]:
-    """Return what a camera sees of the forest, and its trees."""
-    trees = plant(world, seed)
-    light = Light()
+def forest_contents(world: ForestWorld, seed: int, light: Light, glades: Glades = ()) -> Contents:
+    """Return trees and ground; no tree stands in a glade."""
+    trees = plant(world, seed, glades)
     parts = [ground(world)]
+    solids: list[Solid] = []
     for i, tree in enumerate(trees):
         parts += tree_meshes(tree, i + 1, light)
-    images = {
-        "grass": textures.grass(0),
-        "light_map": light_map(world, trees, light, seed),
-        "dapple": textures.dapple(0),
-        "sky": textures.sky(0),
-        **{f"bark{k}": textures.bark(k) for k in range(3)},
-        **{f"leaves{k}": textures.leaves(k) for k in range(2)},
-    }
+        solids.append(frustum_solid(tree.base, tree.top, tree.radius_m, tree.top_radius_m))
+        solids += [ellipsoid_solid(centre, radii) for centre, radii in tree.crowns()]
     across = (1.0 / _length(world), 1.0 / (2 * world.half_width_m))
-    materials = {
-        "ground": Material("grass", (0.4, 0.4), "light_map", across),
-        **{f"bark{k}": Material(f"bark{k}", (1.0, 1.0), "dapple", (0.31, 0.13)) for k in range(3)},
-        **{f"leaves{k}": Material(f"leaves{k}", (0.9, 0.9)) for k in range(2)},
-        "sky": Material("sky", (2.0, 1.0), sky=True),
-    }
-    return Scene(parts, materials, images, light, sky_mesh()), trees
+    return Contents(
+        meshes=tuple(parts),
+        solids=tuple(solids),
+        discs=tuple(tree.disc_at(MAP_HEIGHT_M) for tree in trees),
+        materials={"ground": Material("grass", (0.4, 0.4), "light_map", across)},
+        textures={"light_map": light_map(world, trees, light, seed)},
+    )
 
 
 def _length(world: ForestWorld) -> float:
     return world.run_in_m + world.course_m + world.run_out_m
-
-
-def sky_mesh() -> Mesh:
-    """Return the dome that follows the eye."""
-    vertices, uv, _, triangles = meshes.sky_dome(math.radians(textures.SKY_LOWEST_DEG))
-    return Mesh(vertices, uv, np.ones(len(vertices)), triangles, "sky", SKY_OBJECT, two_sided=True)
 
 
 def ground(world: ForestWorld) -> Mesh:

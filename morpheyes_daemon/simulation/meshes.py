@@ -183,3 +183,28 @@ def joined(surfaces: list[Surface]) -> Surface:
         np.concatenate([s[2] for s in surfaces]),
         np.concatenate([s[3] + start for s, start in zip(surfaces, starts, strict=False)]).astype(np.int32),
     )
+
+
+def box(T: Array, edges_m: tuple[float, float, float]) -> Surface:
+    """Return a box of given edges at pose T (4, 4); texture coordinates are metres along its edges."""
+    corners, uvs, normals = [], [], []
+    half = 0.5 * np.array(edges_m)
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        for sign in (-1.0, 1.0):
+            ring = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)][:: int(sign)], dtype=float)
+            face = np.zeros((4, 3))
+            face[:, axis], face[:, u], face[:, v] = sign * half[axis], ring[:, 0] * half[u], ring[:, 1] * half[v]
+            corners.append(face)
+            # the vertical axis of the box stays the vertical of its texture
+            order = (v, u) if u == 2 else (u, v)
+            uvs.append(face[:, order] + (axis + 0.5 * sign))
+            normals.append(np.tile(sign * np.eye(3)[axis], (4, 1)))
+    vertices = np.concatenate(corners) @ T[:3, :3].T + T[:3, 3]
+    return vertices, np.concatenate(uvs), np.concatenate(normals) @ T[:3, :3].T, quad_triangles(6)
+
+
+def quad_triangles(count: int) -> Triangles:
+    """Return the two triangles of each of `count` quadrilaterals whose corners follow each other."""
+    first = 4 * np.arange(count)[:, None]
+    return np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])]).astype(np.int32)

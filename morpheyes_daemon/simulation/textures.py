@@ -223,6 +223,13 @@ SKY_STOPS = [
 
 
 @cache
+def stains(seed: int, size: int = 256) -> Texture:
+    """Blotches of colour, for modulation: no two tiles of a repeated texture look the same to a matcher."""
+    rng = np.random.default_rng([seed, 11])
+    return finished(128.0 + 15.0 * np.stack([noise(rng, size, slope=0.9) for _ in range(3)], axis=-1))
+
+
+@cache
 def sky(seed: int, size: int = 1024) -> Texture:
     """Half a panorama (u: 180 degrees of azimuth), v from the zenith (0) to below the horizon: clouds, far woods."""
     rng = np.random.default_rng([seed, 5])
@@ -244,3 +251,90 @@ def _wood(rng: np.random.Generator, bgr: Field, elevation: Field, height_deg: fl
     trees = trees * (1 - distance) + distance * np.array([168, 182, 172])
     edge = np.clip((crowns - elevation) / 0.15, 0, 1)[..., None]
     return np.asarray(bgr * (1 - edge) + trees * edge)
+
+
+MURAL_BGR = np.array(
+    [(84, 64, 38), (150, 142, 42), (106, 157, 42), (105, 196, 233), (97, 162, 244), (81, 111, 231), (184, 206, 222),
+     (138, 96, 74)], dtype=np.float64,
+)  # fmt: skip
+"""Night blue, teal, green, sand, orange, coral, cream, slate."""
+
+
+@cache
+def mural(seed: int, size: int = 1024) -> Texture:
+    """A painted wall, four metres square: patches of all sizes and colours under grain."""
+    rng = np.random.default_rng([seed, 6])
+    canvas = np.full((size, size, 3), MURAL_BGR[0]).astype(np.uint8)
+    for k in range(1100):
+        reach = 420.0 * (k + 4) ** -0.6
+        axes = (int(rng.uniform(0.5, 1.6) * reach) + 2, int(rng.uniform(0.3, 1.0) * reach) + 2)
+        colour = np.clip(MURAL_BGR[rng.integers(0, len(MURAL_BGR))] + rng.normal(0, 14, 3), 0, 255)
+        _wrapped_ellipse(canvas, rng.integers(0, size, 2), axes, float(rng.uniform(0, 180)), colour)
+    return finished(canvas * (1.0 + 0.13 * noise(rng, size, slope=0.9))[..., None])
+
+
+@cache
+def newsprint(seed: int, size: int = 1024) -> Texture:
+    """A wall pasted with sheets of print, four metres square: strong contrast down to small letters."""
+    rng = np.random.default_rng([seed, 7])
+    canvas = np.full((size, size, 3), (128, 140, 148), np.uint8)
+    for _ in range(260):
+        _sheet(rng, canvas, rng.integers(0, size, 2), rng.integers(120, 260, 2))
+    return finished(canvas * (1.0 + 0.08 * noise(rng, size, slope=1.0))[..., None])
+
+
+def _sheet(rng: np.random.Generator, canvas: Texels, corner: NDArray[np.int64], edges: NDArray[np.int64]) -> None:
+    """Paste one sheet of lines of words, wrapping around the canvas."""
+    h, w = int(edges[0]), int(edges[1])
+    paper = np.full((h, w, 3), rng.uniform(110, 215) * np.array([0.88, 0.96, 1.0]), np.uint8)
+    y, ink = 8, rng.uniform(25, 80) + rng.normal(0, 8, 3)
+    while y < h - 12:
+        letter = int(rng.choice([4, 5, 7, 16], p=[0.4, 0.3, 0.2, 0.1]))
+        x = 6
+        while x < w - 10:
+            length = int(rng.integers(2, 8)) * letter // 2
+            paper[y : y + letter, x : min(x + length, w - 6)] = np.clip(ink + rng.normal(0, 22), 0, 255)
+            x += length + letter // 2 + 1
+        y += letter + 3
+    rows, columns = (corner[0] + np.arange(h)) % canvas.shape[0], (corner[1] + np.arange(w)) % canvas.shape[1]
+    canvas[np.ix_(rows, columns)] = paper
+
+
+@cache
+def planks(seed: int, size: int = 1024) -> Texture:
+    """Floor boards, two metres square, grain along u."""
+    rng = np.random.default_rng([seed, 8])
+    grain = 0.8 * noise(rng, size, (5.0, 1.0), 1.0) + 0.5 * noise(rng, size, slope=0.8)
+    boards = 12
+    row = np.arange(size) * boards // size
+    tone = rng.normal(0, 0.5, boards)[row][:, None]
+    bgr = coloured(grain + tone, [(-2.5, (62, 40, 24)), (0.0, (140, 98, 62)), (2.5, (206, 164, 116))])
+    joint = (np.arange(size) % (size / boards) < 5)[:, None, None]
+    return finished(np.where(joint, 0.4 * bgr, bgr))
+
+
+@cache
+def wallpaper(seed: int, size: int = 1024) -> Texture:
+    """Rough plaster with stains, three metres square."""
+    rng = np.random.default_rng([seed, 9])
+    value = noise(rng, size, slope=0.8) + 0.6 * noise(rng, size, slope=1.5)
+    stops = [
+        [(-2.5, (92, 104, 112)), (0.0, (172, 178, 176)), (2.5, (228, 226, 214))],
+        [(-2.5, (120, 84, 58)), (0.0, (196, 162, 124)), (2.5, (238, 216, 184))],
+    ][seed % 2]
+    bgr = coloured(value, stops).astype(np.uint8)
+    for _ in range(160):
+        colour = rng.uniform(50, 200, 3)
+        axes = (int(rng.integers(3, 22)), int(rng.integers(3, 22)))
+        _wrapped_ellipse(bgr, rng.integers(0, size, 2), axes, float(rng.uniform(0, 180)), colour)
+    return finished(bgr.astype(np.float64))
+
+
+@cache
+def patchwork(seed: int, size: int = 256) -> Texture:
+    """Small bright squares, for a cube; one tile covers 0.3 m."""
+    rng = np.random.default_rng([seed, 10])
+    coarse = rng.uniform(25, 245, (8, 8, 3))
+    fine = rng.uniform(-60, 60, (32, 32, 3))
+    bgr = np.kron(coarse, np.ones((size // 8, size // 8, 1))) + np.kron(fine, np.ones((size // 32, size // 32, 1)))
+    return finished(bgr)

@@ -6,46 +6,65 @@ that kind's parameters; the seed plants it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
 
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.simulation import forest
-from morpheyes_daemon.simulation.collision import CollisionWorld, Solid, VehicleShape, ellipsoid_solid, frustum_solid
-from morpheyes_daemon.simulation.forest import ForestWorld
-from morpheyes_daemon.simulation.scene import Scene
+from morpheyes_daemon.simulation import meshes, textures
+from morpheyes_daemon.simulation.collision import CollisionWorld, VehicleShape
+from morpheyes_daemon.simulation.contents import Contents, Disc, GapTruth
+from morpheyes_daemon.simulation.forest import ForestWorld, forest_contents
+from morpheyes_daemon.simulation.gap import GapWorld, gap_contents
+from morpheyes_daemon.simulation.looks import materials_of, textures_of
+from morpheyes_daemon.simulation.room import LAMPS, Cube, RoomWorld, cube_contents, room_contents
+from morpheyes_daemon.simulation.scene import SKY_OBJECT, Light, Mesh, Scene
 from morpheyes_daemon.transforms import Array
 from morpheyes_daemon.yaml_source import load_model
 
 FOLDER = Path(__file__).parent / "worlds"
+
+FLYING_HEIGHT_M = 1.5
+"""Height of start and goal over the ground."""
+
+
+class MixedWorld(Section):
+    """A forest, a wall with an opening in a glade of it, and a cube that crosses behind."""
+
+    kind: Literal["mixed"]
+    forest: ForestWorld
+    gap: GapWorld
+    cube: Cube | None = None
+
+
+AnyWorld = Annotated[ForestWorld | GapWorld | RoomWorld | MixedWorld, Field(discriminator="kind")]
 
 
 class WorldFile(Section):
     """The whole of a world file."""
 
     description: str = ""
-    world: ForestWorld
-
-
-@dataclass(frozen=True, slots=True)
-class Disc:
-    """A round obstacle on the map: a trunk at flying height."""
-
-    x_m: float
-    y_m: float
-    radius_m: float
+    world: AnyWorld
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """A planted world: what is seen, what is hit, where a flight starts and where it should end (ned)."""
+    """A planted world: what is seen, what is hit, where a flight starts and where it should end (ned).
+
+    `discs` are trunks for the map, `gaps` the walls with openings.
+    """
 
     scene: Scene
     collisions: CollisionWorld
     start_ned_m: tuple[float, float, float]
     goal_ned_m: tuple[float, float, float]
-    discs: tuple[Disc, ...]
+    discs: tuple[Disc, ...] = ()
+    gaps: tuple[GapTruth, ...] = ()
 
     def clearance_m(
         self, p_ned_m: Array, R_ned_frd: Array, shape: VehicleShape, baseline_m: float, t_s: float = 0.0
@@ -71,18 +90,42 @@ def load_world(name: str) -> WorldFile:
 
 def build_world(file: WorldFile, seed: int) -> World:
     """Plant a world by its seed."""
-    return _build_forest(file.world, seed)
+    world = file.world
+    match world:
+        case ForestWorld():
+            return _world(forest_contents(world, seed, Light()), Light(), world.course_m)
+        case GapWorld():
+            return _world(gap_contents(world, seed, Light()), Light(), _behind_wall_m(world))
+        case RoomWorld():
+            return _world(room_contents(world, LAMPS), LAMPS, world.length_m - world.behind_m - 2.0, with_sky=False)
+        case MixedWorld():
+            return _world(_mixed(world, seed, Light()), Light(), world.forest.course_m)
 
 
-def _build_forest(world: ForestWorld, seed: int, height_m: float = 1.5) -> World:
-    scene, trees = forest.build_scene(world, seed)
-    solids: list[Solid] = []
-    for tree in trees:
-        solids.append(frustum_solid(tree.base, tree.top, tree.radius_m, tree.top_radius_m))
-        solids += [ellipsoid_solid(centre, radii) for centre, radii in tree.crowns()]
-    discs = []
-    for tree in trees:
-        middle = tree.base + height_m / tree.height_m * (tree.top - tree.base)
-        discs.append(Disc(float(middle[0]), float(middle[1]), tree.radius_at_m(height_m)))
-    start, goal = (0.0, 0.0, -height_m), (world.course_m, 0.0, -height_m)
-    return World(scene, CollisionWorld(solids), start, goal, tuple(discs))
+def _behind_wall_m(world: GapWorld) -> float:
+    return world.distance_m + 0.5 * world.mural_m
+
+
+def _mixed(world: MixedWorld, seed: int, light: Light) -> Contents:
+    gap = world.gap.model_copy(update={"meadow": False})
+    glade = (gap.distance_m + 0.5 * gap.mural_m, 0.0, gap.half_width_m + gap.mural_m + 2.0)
+    found = forest_contents(world.forest, seed, light, (glade,)) + gap_contents(gap, seed, light)
+    return found if world.cube is None else found + cube_contents(world.cube, light)
+
+
+def _world(contents: Contents, light: Light, goal_m: float, with_sky: bool = True) -> World:
+    sky = sky_mesh() if with_sky else None
+    shown = [*contents.meshes, *(mesh for body in contents.moving for mesh in body.meshes), *([sky] if sky else [])]
+    materials = materials_of(shown, contents.materials)
+    scene = Scene(
+        contents.meshes, materials, textures_of(materials.values(), contents.textures), light, sky, contents.moving
+    )
+    collisions = CollisionWorld(contents.solids, contents.obstacles)
+    start, goal = (0.0, 0.0, -FLYING_HEIGHT_M), (goal_m, 0.0, -FLYING_HEIGHT_M)
+    return World(scene, collisions, start, goal, contents.discs, contents.gaps)
+
+
+def sky_mesh() -> Mesh:
+    """Return the dome that follows the eye."""
+    vertices, uv, _, triangles = meshes.sky_dome(math.radians(textures.SKY_LOWEST_DEG))
+    return Mesh(vertices, uv, np.ones(len(vertices)), triangles, "sky", SKY_OBJECT, two_sided=True)

@@ -49,12 +49,12 @@ def flat_points(solid: Solid, n: int) -> Array:
         one = np.ones_like(a)
         faces = [np.roll(np.column_stack([sign * one, a, b]), k, axis=1) for k in range(3) for sign in (-1, 1)]
         return np.concatenate(faces) * solid.size[:3]
-    corners = np.array(solid.size[:6]).reshape(3, 2)
+    corners = np.array(solid.size[:8]).reshape(4, 2)
     w = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
-    inside = w @ corners
+    inside = np.concatenate([w @ corners[[0, 1, 2]], w @ corners[[0, 2, 3]]])
     rim = np.concatenate([(1 - t) * corners + t * np.roll(corners, 1, axis=0) for t in np.linspace(0, 1, 2 * n)])
-    caps = [np.column_stack([inside, np.full(len(inside), z)]) for z in (-solid.size[6], solid.size[6])]
-    walls = [np.column_stack([rim, np.full(len(rim), z * solid.size[6])]) for z in s]
+    caps = [np.column_stack([inside, np.full(len(inside), z)]) for z in (-solid.size[8], solid.size[8])]
+    walls = [np.column_stack([rim, np.full(len(rim), z * solid.size[8])]) for z in s]
     return np.concatenate([*caps, *walls])
 
 
@@ -76,7 +76,8 @@ def round_points(solid: Solid, n: int) -> Array:
 def random_solid(rng: np.random.Generator, kind: int, where: Array) -> Solid:
     T = pose(R_from_rotvec(rng.uniform(-2, 2, 3)), where)
     if kind == PRISM:
-        return prism_solid(T, rng.uniform(-0.5, 0.5, (3, 2)), 0.05)
+        angle = np.sort(rng.uniform(0, 2 * math.pi, int(rng.integers(3, 5))))
+        return prism_solid(T, 0.5 * np.column_stack([np.cos(angle), np.sin(angle)]), 0.05)
     return Solid(kind, T, tuple(rng.uniform(0.1, 0.5, 3).tolist()))
 
 

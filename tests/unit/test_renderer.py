@@ -10,10 +10,11 @@ import pytest
 
 from morpheyes_daemon.messages import Pinhole
 from morpheyes_daemon.simulation import meshes
-from morpheyes_daemon.simulation.forest import ForestWorld, build_scene
+from morpheyes_daemon.simulation.forest import ForestWorld
 from morpheyes_daemon.simulation.renderer import Rendered, Renderer
 from morpheyes_daemon.simulation.scene import Material, Mesh, MovingObject, Scene
 from morpheyes_daemon.simulation.textures import Texture, finished
+from morpheyes_daemon.simulation.worlds import WorldFile, build_world
 from morpheyes_daemon.transforms import R_FRD_CAM, Array, R_from_rotvec, R_from_rpy, inverse, pose
 
 SMALL = Pinhole(96, 72, 111.0, 47.5, 35.5)
@@ -70,7 +71,7 @@ def nearest_hit(corners: Array, rays: Array, two_sided: bool) -> Array:
 
 @pytest.fixture(scope="module")
 def forest() -> tuple[Scene, Renderer]:
-    scene, _ = build_scene(THIN_FOREST, seed=5)
+    scene = build_world(WorldFile(world=THIN_FOREST), seed=5).scene
     return scene, Renderer(scene)
 
 

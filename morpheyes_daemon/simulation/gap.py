@@ -1,0 +1,110 @@
+"""The gap: a wall with openings of unknown shape and place before a mural, standing still or swaying."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from morpheyes_daemon.config import Section
+from morpheyes_daemon.simulation import meshes
+from morpheyes_daemon.simulation.collision import MovingObstacles, Obstacles, box_solid
+from morpheyes_daemon.simulation.contents import Contents, GapTruth, lit
+from morpheyes_daemon.simulation.motion import Motion, swaying
+from morpheyes_daemon.simulation.openings import Shape, fitted_outline, unit_outline
+from morpheyes_daemon.simulation.scene import GROUND_OBJECT, Light, Mesh, MovingObject
+from morpheyes_daemon.simulation.wall import Wall
+from morpheyes_daemon.transforms import Array, pose
+
+WALL_OBJECT, MURAL_OBJECT = 1, 2
+BELOW_GROUND_M = 1.2
+"""How far the wall goes on below the ground, so that it may sway downwards and upwards."""
+
+
+class Opening(Section):
+    """One opening; what is left out is drawn by the seed."""
+
+    shape: Shape = "rectangle"
+    slack: float = Field(1.0, ge=0.3, le=5, description="1: what the vehicle needs just fits in")
+    across_m: float | None = Field(None, ge=-3, le=3, description="to the right of the course line")
+    height_m: float | None = Field(None, ge=0.8, le=2.4)
+
+
+class GapWorld(Section):
+    """What a gap file may say."""
+
+    kind: Literal["gap"]
+    distance_m: float = Field(7.0, ge=3, le=200, description="from the start at (0, 0) to the wall, along x")
+    fit_width_mm: float = Field(
+        417.0, ge=100, le=2000, description="what must fit in: width in crossing attitude and 40 mm on both sides"
+    )
+    fit_height_mm: float = Field(
+        267.0, ge=80, le=2000, description="height of the hull leaning by 12 degrees and 40 mm on both sides"
+    )
+    openings: tuple[Opening, ...] = Field((Opening(),), min_length=1, max_length=4)
+    motion: Motion = Motion()
+    thickness_mm: float = Field(30.0, ge=5, le=300)
+    half_width_m: float = Field(4.0, ge=1.5, le=20)
+    top_m: float = Field(3.4, ge=2, le=10)
+    mural_m: float = Field(5.0, ge=2, le=50, description="from the wall to the mural behind it")
+    meadow: bool = Field(True, description="grass and sky around; off where another world has them")
+
+
+def gap_contents(world: GapWorld, seed: int, light: Light) -> Contents:
+    """Return wall, mural and ground."""
+    rng = np.random.default_rng([seed, 500])
+    outlines, middle = _place(world, rng)
+    wall = Wall(
+        np.array([-world.half_width_m, -world.top_m]), np.array([world.half_width_m, BELOW_GROUND_M]), outlines,
+        world.thickness_mm / 1e3,
+    )  # fmt: skip
+    T_ned_wall = swaying(world.motion, np.array([world.distance_m, middle, 0.0]), seed)
+    sun = light.direction
+    dark = (0.6, 0.6, 0.6)
+    parts = (
+        lit(wall.faces(), "newsprint", WALL_OBJECT, sun),
+        lit(wall.rims(), "newsprint", WALL_OBJECT, sun, dark, two_sided=True),
+    )
+    standing = Contents(
+        moving=(MovingObject(parts, T_ned_wall, "wall"),),
+        obstacles=(MovingObstacles(Obstacles(wall.solids()), T_ned_wall),),
+        gaps=(GapTruth(outlines, T_ned_wall, wall.thickness_m),),
+    ) + _mural(world, light)
+    return standing + meadow() if world.meadow else standing
+
+
+def _place(world: GapWorld, rng: np.random.Generator) -> tuple[tuple[Array, ...], float]:
+    """Return the outlines in the wall's frame and where its origin is across the course.
+
+    Several openings without a place of their own are spread over the wall, so that they cannot touch.
+    """
+    outlines = [
+        fitted_outline(unit_outline(o.shape, rng), world.fit_width_mm / 1e3, world.fit_height_mm / 1e3, o.slack)
+        for o in world.openings
+    ]
+    widths = np.array([np.ptp(outline[:, 0]) for outline in outlines])
+    lanes = np.cumsum(widths + 0.4) - 0.5 * (widths + 0.4)
+    lanes -= lanes.mean() - rng.uniform(-0.6, 0.6)
+    placed = []
+    for opening, outline, lane in zip(world.openings, outlines, lanes, strict=True):
+        across = float(lane) if opening.across_m is None else opening.across_m
+        height = float(rng.uniform(1.2, 1.8)) if opening.height_m is None else opening.height_m
+        placed.append(outline + np.array([across, -height]))
+    middle = float(np.mean([outline[:, 0].mean() for outline in placed]))
+    return tuple(outline - np.array([middle, 0.0]) for outline in placed), middle
+
+
+def _mural(world: GapWorld, light: Light) -> Contents:
+    x, half, top = world.distance_m + world.mural_m, world.half_width_m + world.mural_m, world.top_m + 1.0
+    T = pose(np.eye(3), np.array([x, 0.0, -0.5 * top]))
+    edges = (0.2, 2 * half, top)
+    mesh = lit(meshes.box(T, edges), "mural", MURAL_OBJECT, light.direction)
+    return Contents(meshes=(mesh,), solids=(box_solid(T, edges),))
+
+
+def meadow(reach_m: float = 140.0) -> Contents:
+    """Return a flat ground of grass."""
+    ends = np.array([-reach_m, reach_m])
+    vertices, uv, _, triangles = meshes.terrain(ends, ends, np.zeros((2, 2)))
+    return Contents(meshes=(Mesh(vertices, uv, np.ones(len(vertices)), triangles, "meadow", GROUND_OBJECT),))
