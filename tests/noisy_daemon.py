@@ -102,6 +102,8 @@ class NoisyDaemon:
     async def __aenter__(self) -> Self:
         self._lives = [asyncio.create_task(self.daemon.run(self._stop)), asyncio.create_task(self._twin.run())]
         await self.pass_time(5.0)
+        for _ in range(20):
+            await self.pass_time(0.1)
         assert self.daemon.gate.has_limits
         return self
 
@@ -251,6 +253,7 @@ def _field(kind: Any, name: str, rng: random.Random) -> Any:
 def _number(wire_type: str, rng: random.Random) -> float | int:
     if wire_type in ("float", "double"):
         return rng.choice(NASTY_FLOATS) if rng.random() < 0.3 else rng.uniform(-100.0, 100.0)
-    code = {"8": "b", "16": "h", "32": "i", "64": "q"}[wire_type.strip("uint_mavlverso") or "8"]
+    bits = next((bits for bits in ("16", "32", "64") if bits in wire_type), "8")
+    code = {"8": "b", "16": "h", "32": "i", "64": "q"}[bits]
     code = code.upper() if wire_type.startswith("u") else code
     return int(struct.unpack(f"<{code}", rng.randbytes(struct.calcsize(f"<{code}")))[0])
