@@ -39,7 +39,7 @@ class VelocityTuning:
     integral_limit_m_s2: float = 0.8
     lean_lag_s: float = 0.15
     max_lean_rad: float = math.radians(20.0)
-    brake_lean_rad: float = math.radians(8.0)
+    brake_lean_rad: float = BRAKE_LEAN_RAD
     stop_lean_rad: float = 0.0
     yaw_gain_1_s: float = 2.0
     yaw_rate_max_rad_s: float = math.radians(60.0)

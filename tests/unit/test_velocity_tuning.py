@@ -9,6 +9,7 @@ import pytest
 from morpheyes_daemon.app import velocity_tuning
 from morpheyes_daemon.config import NoServoConfig, SafetyConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.control.loiter import LoiterModel
+from morpheyes_daemon.control.velocity import BRAKE_LEAN_RAD
 from tests.copter_parameters import copter_parameters
 
 
@@ -21,7 +22,7 @@ def config(**safety: float) -> VehicleConfig:
 def test_a_stop_is_neutral_unless_active_braking_is_asked_for() -> None:
     model = LoiterModel.from_parameters(copter_parameters())
     assert velocity_tuning(config(), model).stop_lean_rad == 0.0
-    assert velocity_tuning(config(active_braking=True, max_lean_deg=20), model).stop_lean_rad > 0.2
+    assert velocity_tuning(config(active_braking=True), model).stop_lean_rad == pytest.approx(BRAKE_LEAN_RAD)
 
 
 def test_every_lean_is_within_what_config_and_autopilot_allow() -> None:
