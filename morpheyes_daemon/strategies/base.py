@@ -64,7 +64,7 @@ class Observation:
     """What `decide` gets: the newest percept and the vehicle now and at exposure.
 
     `reserve_m` is the distance the vehicle needs to stop from its present speed, the governor's reaction time
-    included; `engaged` tells whether the gate lets the mission fly.
+    included; `engaged` tells whether the mission has the vehicle, braking for a gap in the inputs included.
     """
 
     now_ns: int

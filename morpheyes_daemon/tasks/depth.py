@@ -33,7 +33,10 @@ async def depth(
     image_rate_hz: float,
     pulse: Pulse,
 ) -> None:
-    """Have every newest frame looked at; bad images renew no lease, so they end in neutral sticks."""
+    """Have every newest frame looked at; bad images renew no lease, so they end in neutral sticks.
+
+    Rows that drift apart are reported only: correcting them is the drift watch's, and small images tell them badly.
+    """
     frames = topics.frame.reader()
     next_image_ns = 0
     faults: tuple[Reason, ...] = ()
@@ -46,7 +49,7 @@ async def depth(
         for reason in (reason for reason in seen.image_faults if reason not in faults):
             events.publish(Event(clock.now_ns(), "depth", reason, reason.text))
         faults = seen.image_faults
-        if not faults:
+        if Reason.IMAGE_BAD not in faults:
             gate.renew(Lease.DEPTH, frame.t_ns + lease_ns)
         topics.perception.publish(seen)
         pulse.beat()

@@ -42,7 +42,7 @@ def observe(
         at_exposure=track.at(seen.summary.t_ns),
         baseline_m=seen.summary.baseline_m,
         reserve_m=stopping.stopping_distance_m(speed, height_m, reaction_s) if stopping else math.inf,
-        engaged=guardian.state is State.ENGAGED,
+        engaged=guardian.state in (State.ENGAGED, State.BRAKING),
     )
 
 
