@@ -30,13 +30,21 @@ _GOKU = (
 )  # fmt: skip
 
 
-def unit_outline(shape: Shape, rng: np.random.Generator) -> Array:
-    """Return a shape about two units wide; only `blob` uses `rng`."""
+def outline(shape: Shape, rng: np.random.Generator, width_m: float, height_m: float, slack: float = 1.0) -> Array:
+    """Return the smallest opening of a shape that a rectangle fits in, times `slack`, the rectangle's place at (0, 0).
+
+    A rectangular opening is the rectangle itself.
+    """
     if shape == "rectangle":
-        return np.array([[-1.0, -0.7], [1.0, -0.7], [1.0, 0.7], [-1.0, 0.7]])
+        return np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * (width_m, height_m) * 0.5 * slack
+    return fitted(_unit_outline(shape, rng), width_m, height_m) * slack
+
+
+def _unit_outline(shape: Shape, rng: np.random.Generator) -> Array:
+    """Return a shape about two units wide; only a blob uses `rng`."""
     if shape == "goku":
         return np.array(_GOKU) * (1.0, -1.0)
-    theta = np.arange(72) * (2 * math.pi / 72)
+    theta: Array = np.arange(72, dtype=np.float64) * (2 * math.pi / 72)
     radius = _cassini(theta) if shape == "infinity" else _wavy(theta, rng)
     return np.column_stack([radius * np.cos(theta), radius * np.sin(theta)])
 
@@ -54,8 +62,8 @@ def _wavy(theta: Array, rng: np.random.Generator) -> Array:
     return radius
 
 
-def fitted_outline(unit: Array, width_m: float, height_m: float, slack: float = 1.0) -> Array:
-    """Scale a shape so that a rectangle just fits in somewhere, times `slack`, with the rectangle's place at (0, 0)."""
+def fitted(unit: Array, width_m: float, height_m: float) -> Array:
+    """Scale a shape so that a rectangle just fits in somewhere, and put that place at (0, 0)."""
     low, high = 0.05, 20.0
     while high - low > 1e-3 * high:
         scale = math.sqrt(low * high)
@@ -66,7 +74,7 @@ def fitted_outline(unit: Array, width_m: float, height_m: float, slack: float = 
     places = _places(unit, width_m / high, height_m / high)
     v, u = np.nonzero(places)
     centre = np.array([u.mean(), v.mean()]) / _px_per_unit(unit) + unit.min(axis=0)
-    return np.asarray((unit - centre) * high * slack)
+    return np.asarray((unit - centre) * high)
 
 
 def _px_per_unit(unit: Array) -> float:
