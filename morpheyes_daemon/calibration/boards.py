@@ -70,6 +70,11 @@ class Board:
         return np.asarray(flat * self.square_m, dtype=np.float64)
 
     @property
+    def least_square_px(self) -> float:
+        """How wide a square must be in the image to be found; a marker's bits need room."""
+        return 22.0 if self.kind == "charuco" else 9.0
+
+    @property
     def label(self) -> str:
         """The board as `--board` takes it."""
         if self.kind == "charuco":

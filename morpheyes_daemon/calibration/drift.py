@@ -127,7 +127,8 @@ class DriftMonitor:
         f_px = depth.pinhole.f_px
         findings = self._judge_rows(offsets.median_px, f_px, nominal_m)
         if not findings and offsets.median_px < 2 * self.limits.rows_px:
-            self._yaw.add(Look(depth.t_ns, left, right, disparity, depth.baseline_m, depth.pinhole, motion, *self._late))
+            seen = (disparity, depth.baseline_m, depth.pinhole, motion)
+            self._yaw.add(Look(depth.t_ns, left, right, *seen, *self._late))
             findings += self._judge_yaw(f_px, nominal_m)
         findings += self._judge_late()
         report = self._report(offsets.median_px, offsets.count, self._fit, tuple(findings))

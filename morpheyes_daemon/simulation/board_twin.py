@@ -31,9 +31,7 @@ _SPOT_PX = 0.6
 """Sigma of the lens's spot: diffraction at f/2.6 and a little defocus on 2.8 um pixels."""
 _MARGIN_PX = 6.0
 _NEAREST_FILL = 0.92
-"""The nearest board spans this share of what both eyes see ..."""
-_FARTHEST_SQUARE_PX = 9.0
-"""... and the farthest one still has squares this wide."""
+"""The nearest board spans this share of what both eyes see, the farthest one still has squares that can be found."""
 _TILT_RAD = 0.6
 _GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
@@ -44,6 +42,10 @@ class FlatBoard(Protocol):
     @property
     def square_m(self) -> float:
         """Side of a square."""
+
+    @property
+    def least_square_px(self) -> float:
+        """How wide a square must be in the image to be found."""
 
     @property
     def points_m(self) -> Array:
@@ -196,7 +198,7 @@ def _distances(camera: CameraIntrinsics, board: FlatBoard, baseline_m: float) ->
         (extent[0] / _NEAREST_FILL + baseline_m) * camera.fx / camera.width,
         extent[1] / _NEAREST_FILL * camera.fy / camera.height,
     )
-    return near, max(camera.fx * board.square_m / _FARTHEST_SQUARE_PX, 1.2 * near)
+    return near, max(camera.fx * board.square_m / board.least_square_px, 1.2 * near)
 
 
 def _project(points_m: Array, T_cam_board: Array, pinhole: Pinhole) -> NDArray[np.float64]:
