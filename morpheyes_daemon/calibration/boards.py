@@ -70,6 +70,11 @@ class Board:
         return np.asarray(flat * self.square_m, dtype=np.float64)
 
     @property
+    def clear_share(self) -> float:
+        """Share of a square around a corner that holds nothing but the four squares; markers stand farther off."""
+        return min(_WINDOW_SHARE, (1.0 - self.marker_share) / 2) if self.kind == "charuco" else _WINDOW_SHARE
+
+    @property
     def least_square_px(self) -> float:
         """How wide a square must be in the image to be found; a marker's bits need room."""
         return 22.0 if self.kind == "charuco" else 9.0
@@ -174,7 +179,8 @@ def _refined(picture: Image, corners: Array, board: Board) -> Array:
     """Move each corner to its saddle point, in a window as wide as its neighbours and the image's border allow."""
     last = np.array([picture.shape[1] - 1, picture.shape[0] - 1])
     room = np.minimum(corners, last - corners).min(axis=1) - 1.0
-    half = np.clip(np.floor(np.minimum(_WINDOW_SHARE * spacing_px(corners, board), room)), *_WINDOW_LIMITS_PX)
+    reach = board.clear_share * spacing_px(corners, board)
+    half = np.clip(np.floor(np.minimum(reach, room)), *_WINDOW_LIMITS_PX)
     refined = corners.copy()
     for window in np.unique(half[np.isfinite(half)]).astype(int):
         chosen = half == window
