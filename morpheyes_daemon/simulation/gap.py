@@ -12,7 +12,7 @@ from morpheyes_daemon.simulation import meshes
 from morpheyes_daemon.simulation.collision import MovingObstacles, Obstacles, box_solid
 from morpheyes_daemon.simulation.contents import Contents, GapTruth, lit
 from morpheyes_daemon.simulation.motion import Motion, swaying
-from morpheyes_daemon.simulation.openings import Shape, fitted_outline, unit_outline
+from morpheyes_daemon.simulation.openings import Shape, outline
 from morpheyes_daemon.simulation.scene import GROUND_OBJECT, Light, Mesh, MovingObject
 from morpheyes_daemon.simulation.wall import Wall
 from morpheyes_daemon.transforms import Array, pose
@@ -79,20 +79,18 @@ def _place(world: GapWorld, rng: np.random.Generator) -> tuple[tuple[Array, ...]
 
     Several openings without a place of their own are spread over the wall, so that they cannot touch.
     """
-    outlines = [
-        fitted_outline(unit_outline(o.shape, rng), world.fit_width_mm / 1e3, world.fit_height_mm / 1e3, o.slack)
-        for o in world.openings
-    ]
-    widths = np.array([np.ptp(outline[:, 0]) for outline in outlines])
+    width, height = world.fit_width_mm / 1e3, world.fit_height_mm / 1e3
+    shapes = [outline(o.shape, rng, width, height, o.slack) for o in world.openings]
+    widths = np.array([np.ptp(shape[:, 0]) for shape in shapes])
     lanes = np.cumsum(widths + 0.4) - 0.5 * (widths + 0.4)
     lanes -= lanes.mean() - rng.uniform(-0.6, 0.6)
     placed = []
-    for opening, outline, lane in zip(world.openings, outlines, lanes, strict=True):
+    for opening, shape, lane in zip(world.openings, shapes, lanes, strict=True):
         across = float(lane) if opening.across_m is None else opening.across_m
         height = float(rng.uniform(1.2, 1.8)) if opening.height_m is None else opening.height_m
-        placed.append(outline + np.array([across, -height]))
-    middle = float(np.mean([outline[:, 0].mean() for outline in placed]))
-    return tuple(outline - np.array([middle, 0.0]) for outline in placed), middle
+        placed.append(shape + np.array([across, -height]))
+    middle = float(np.mean([corners[:, 0].mean() for corners in placed]))
+    return tuple(corners - np.array([middle, 0.0]) for corners in placed), middle
 
 
 def _mural(world: GapWorld, light: Light) -> Contents:

@@ -47,11 +47,12 @@ class Wall:
         """Cut what is between the openings at the height of every corner, so that only trapezoids are left."""
         starts = np.concatenate(self.outlines)
         ends = np.concatenate([np.roll(outline, -1, axis=0) for outline in self.outlines])
-        heights = np.unique(starts[:, 1])
+        heights = np.unique(np.round(starts[:, 1], 9))
         pieces = []
         for top, bottom in pairwise(heights):
-            above = np.minimum(starts[:, 1], ends[:, 1]) <= top
-            below = np.maximum(starts[:, 1], ends[:, 1]) >= bottom
+            middle = 0.5 * (top + bottom)
+            above = np.minimum(starts[:, 1], ends[:, 1]) < middle
+            below = np.maximum(starts[:, 1], ends[:, 1]) > middle
             a, b = starts[above & below], ends[above & below]
             slope = (b[:, 0] - a[:, 0]) / (b[:, 1] - a[:, 1])
             at_top, at_bottom = (a[:, 0] + (z - a[:, 1]) * slope for z in (top, bottom))
