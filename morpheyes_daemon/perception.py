@@ -113,7 +113,7 @@ class Pipeline:
         """Return why the frame must not be flown on, empty when it may."""
         found = exposure_faults(pair.left, pair.right)
         found |= matching_faults(pair.left, pair.right, depth.valid_fraction)
-        # AlikeCheck is not asked yet: its limits trip in good flights
+        found |= self._alike.check(pair.left, pair.right, depth.baseline_m * depth.pinhole.f_px / depth.depth_m)
         if self._frozen.check(frame.left, frame.right):
             found.add(ImageFault.FROZEN)
         reasons = {_REASONS.get(fault, Reason.IMAGE_BAD) for fault in found}
