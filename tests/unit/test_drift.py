@@ -1,0 +1,53 @@
+"""The drift watch: a turned rig is what it says, strong evidence is needed, and nothing is done without texture."""
+
+import math
+
+import numpy as np
+import pytest
+
+from morpheyes_daemon.calibration.drift import turned_rig
+from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates
+from morpheyes_daemon.calibration.rectified import StereoGeometry, infinity_px
+from morpheyes_daemon.calibration.yaw_watch import leverage
+from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.transforms import R_from_rotvec, inverse, pose
+from tests.synthetic_rig import CAM0, CAM1, TEN_M, true_geometry, true_pose
+
+
+def test_a_rig_turned_by_a_yaw_shows_that_much_disparity_at_infinity() -> None:
+    rig = RigModel.from_poses(CAM0, CAM1, TEN_M.tolist(), [true_pose(b) for b in TEN_M])
+    yaw = math.radians(0.15)
+    turned = turned_rig(rig, np.array([0.0, yaw, 0.0]), 0.2)
+    believed = StereoGeometry(CAM0, CAM1, rig.T_cam0_cam1(TEN_M[4]))
+    true = StereoGeometry(CAM0, CAM1, turned.T_cam0_cam1(TEN_M[4]))
+    # f yaw in the middle of the image, up to 18 % more at its sides
+    assert np.median(infinity_px(believed, true)) == pytest.approx(believed.f_px * yaw, rel=0.1)
+    assert turned.length_m(0.2) == pytest.approx(rig.length_m(0.2))
+    assert turned.hash != rig.hash
+
+
+def test_turning_back_gives_the_rig_again() -> None:
+    rig = RigModel.from_poses(CAM0, CAM1, TEN_M.tolist(), [true_pose(b) for b in TEN_M])
+    turn = np.radians([0.1, -0.2, 0.05])
+    again = turned_rig(turned_rig(rig, turn, 0.2), -turn, 0.2)
+    assert again.T_cam0_cam1(0.17) == pytest.approx(rig.T_cam0_cam1(0.17), abs=1e-9)
+
+
+def test_rates_of_the_right_eye_are_those_of_moving_the_rig() -> None:
+    pinhole, b = Pinhole(640, 480, 740.0, 319.5, 239.5), 0.25
+    v, w, dt = np.array([0.4, -0.3, 2.0]), np.array([0.2, -0.3, 0.4]), 1e-6
+    motion = EyeMotion(np.eye(4), v, w)
+    points = np.array([[0.3, -0.2, 2.0], [-0.8, 0.5, 4.0], [1.0, 0.2, 8.0]])
+    middle = np.array([pinhole.cx_px, pinhole.cy_px])
+    uv = points[:, :2] / points[:, 2:] * pinhole.f_px + middle
+    T_before_after = pose(R_from_rotvec(w * dt), v * dt)
+    moved = points @ inverse(T_before_after)[:3, :3].T + inverse(T_before_after)[:3, 3]
+    right = [(p - [b, 0, 0])[:, :2] / p[:, 2:] * pinhole.f_px + middle for p in (points, moved)]
+    rates = right_eye_rates(uv, b * pinhole.f_px / points[:, 2], pinhole, b, motion)
+    assert rates == pytest.approx((right[1] - right[0]) / dt, rel=1e-3, abs=1e-2), "first order over a microsecond"
+
+
+def test_a_wider_change_of_baseline_tells_more() -> None:
+    assert leverage(0.1, 0.3) > leverage(0.1, 0.2) > leverage(0.2, 0.3) > leverage(0.2, 0.2) == 0.0
+    assert true_geometry(0.2).length_m == pytest.approx(0.2, abs=0.01)
