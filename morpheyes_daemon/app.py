@@ -45,8 +45,8 @@ from morpheyes_daemon.tasks.obstacles import obstacles
 from morpheyes_daemon.tasks.sticks import sticks
 from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride
 
-ALARMS = frozenset({Reason.OVERRIDE_IGNORED, Reason.AUTOPILOT_REBOOTED})
-"""What the hub reports that ends a flight in HOLD."""
+ALARMS = frozenset({Reason.OVERRIDE_IGNORED, Reason.AUTOPILOT_REBOOTED, Reason.BASELINE_STALE})
+"""What the devices report that ends a flight in HOLD."""
 
 STATE_NUMBERS: dict[State, int] = {state: number for number, state in enumerate(State)}
 """What NAMED_VALUE_INT carries for a state."""
@@ -207,7 +207,7 @@ class Daemon:
         self.track.add(vehicle)
 
     def _on_event(self, event: Event) -> None:
-        if event.source == "autopilot" and event.reason in ALARMS:
+        if event.source != "guardian" and event.reason in ALARMS:
             self.guardian.alarm(event.reason, event.t_ns)
 
     def _on_parameters(self, values: Mapping[str, float]) -> None:

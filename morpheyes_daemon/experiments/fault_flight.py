@@ -63,14 +63,15 @@ class Sent(StrEnum):
 class Measured:
     """What one fault did. Times count from the fault; None: it did not happen.
 
-    `reaction_s`: the first message that deflects no stick. `release_s`: the first release. `neutrals` and
-    `sticks_after` count messages after the reaction. `stop_m`: flown from the fault to standstill; `reserved_m`: what
-    the governor had kept free for that at the moment of the fault.
+    `reaction_s`: the first message that deflects no stick; `quiet_s`: the first after which none did. `release_s`: the
+    first release. `neutrals` counts neutral messages, `sticks_after` the others after the reaction. `stop_m`: flown
+    from the fault to standstill; `reserved_m`: what the governor had kept free for that at the moment of the fault.
     """
 
     state: State
     reason: Reason
     reaction_s: float | None
+    quiet_s: float | None
     release_s: float | None
     neutrals: int
     sticks_after: int
@@ -215,6 +216,7 @@ class FaultFlight:
             state=self.state,
             reason=self.daemon.guardian.reason,
             reaction_s=quiet[0] if quiet else None,
+            quiet_s=_quiet_s(sent),
             release_s=released[0] if released else None,
             neutrals=[kind for _, kind in sent].count(Sent.NEUTRAL),
             sticks_after=after.count(Sent.STICKS),
@@ -240,6 +242,13 @@ class FaultFlight:
             widths = struct.unpack_from("<4H", data, 10)
             kind = {NEUTRAL_US: Sent.NEUTRAL, (0, 0, 0, 0): Sent.RELEASE}.get(widths, Sent.STICKS)
             self._sent.append((self.clock.now_ns(), kind))
+
+
+def _quiet_s(sent: list[tuple[float, Sent]]) -> float | None:
+    """Return when the first message after the last deflected stick went out; None when there is none."""
+    sticks = [index for index, (_, kind) in enumerate(sent) if kind is Sent.STICKS]
+    after = sent[sticks[-1] + 1 if sticks else 0 :]
+    return after[0][0] if after else None
 
 
 class _Path:

@@ -191,13 +191,18 @@ def make_row(fault: Fault, state: State, seed: int, seen: Measured | None, wrong
         allowed_s=round(fault.notice_s + (RELEASE_S if fault.endings[state] is Ending.RELEASES else REACTION_S), 3),
         ended=seen.state if seen else "",
         reason=seen.reason if seen else "",
-        reaction_s=_rounded(seen.reaction_s if seen and in_flight else None),
+        reaction_s=_rounded(_reaction_s(fault, state, seen) if seen and in_flight else None),
         release_s=_rounded(seen.release_s if seen else None),
         stop_m=_rounded(seen.stop_m if seen and in_flight else None),
         reserved_m=_rounded(seen.reserved_m if seen and in_flight else None),
         clearance_m=_rounded(seen.clearance_m if seen else None),
         complaints=wrong,
     )
+
+
+def _reaction_s(fault: Fault, state: State, seen: Measured) -> float | None:
+    """When it was neutral for good; where it flies on, when it was neutral first."""
+    return seen.reaction_s if fault.endings[state] is Ending.RESUMES else seen.quiet_s
 
 
 def _rounded(value: float | None) -> float | None:

