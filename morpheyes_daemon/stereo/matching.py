@@ -22,6 +22,9 @@ from morpheyes_daemon.messages import FloatMap, Image
 
 Mask = NDArray[np.bool_]
 
+COARSE_TALL = 2
+"""Coarse pixels are so much taller than wide: half the time, and what is near is tall as well."""
+
 STEP = 16
 """OpenCV wants the number of disparities to be a multiple of this."""
 
@@ -148,11 +151,11 @@ def _too_near(left: Image, right: Image, low: int, count: int, settings: MatchSe
     """Return where a coarse search over a longer range prefers a disparity beyond the fine search's ceiling."""
     height, width = left.shape
     scale = max(1, round(width / settings.coarse_width_px))
-    small_left, small_right = (_shrunk(eye, scale, scale) for eye in (left, right))
+    small_left, small_right = (_shrunk(eye, scale, COARSE_TALL * scale) for eye in (left, right))
     reach = disparity_range(count * settings.coarse_range / scale, small_left.shape[1])
     coarse = semi_global(small_left, small_right, low // scale, reach, settings, settings.coarse_speckle_px)
     beyond = coarse * scale > low + count + scale / 2
-    return _grown(beyond, scale, scale, (height, width))
+    return _grown(beyond, scale, COARSE_TALL * scale, (height, width))
 
 
 def _shrunk(image: Image, across: int, down: int) -> Image:
