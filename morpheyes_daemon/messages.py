@@ -175,6 +175,28 @@ class VehicleState:
     landed: bool = True
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """A moving object as of one frame: filtered position and velocity in ned with their covariance (6, 6).
+
+    `seen` tells whether this very frame showed it; `p_rect_m` is then the middle of its visible face as measured, in
+    the axes of the frame's rectified left eye (else as predicted), and `pixels` how many were its own. `radius_m` is
+    half its size across. `id` changes when another object, or the same after a loss, is followed.
+    """
+
+    seq: int
+    t_ns: int
+    id: int
+    seen: bool
+    p_ned_m: tuple[float, float, float]
+    v_ned_m_s: tuple[float, float, float]
+    covariance: Vector
+    p_rect_m: tuple[float, float, float]
+    radius_m: float
+    pixels: int
+    baseline_m: float
+
+
 class Intent(StrEnum):
     """What the mission wants of the vehicle."""
 
