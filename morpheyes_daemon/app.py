@@ -45,8 +45,16 @@ from morpheyes_daemon.tasks.obstacles import obstacles
 from morpheyes_daemon.tasks.sticks import sticks
 from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride
 
-ALARMS = frozenset({Reason.OVERRIDE_IGNORED, Reason.AUTOPILOT_REBOOTED, Reason.BASELINE_STALE})
-"""What the devices report that ends a flight in HOLD."""
+ALARMS = frozenset(
+    {
+        Reason.OVERRIDE_IGNORED,
+        Reason.AUTOPILOT_REBOOTED,
+        Reason.BASELINE_STALE,
+        Reason.SERVO_LOST,
+        Reason.WORKER_LOST,
+    }
+)
+"""What the devices report that ends a flight in HOLD, though they may be well again a moment later."""
 
 STATE_NUMBERS: dict[State, int] = {state: number for number, state in enumerate(State)}
 """What NAMED_VALUE_INT carries for a state."""
@@ -209,6 +217,8 @@ class Daemon:
     def _on_event(self, event: Event) -> None:
         if event.source != "guardian" and event.reason in ALARMS:
             self.guardian.alarm(event.reason, event.t_ns)
+        if event.source == "servo" and event.reason in ALARMS and self._model is not None:
+            self._model.doubt(self._model.at(event.t_ns).target_m, event.t_ns)
 
     def _on_parameters(self, values: Mapping[str, float]) -> None:
         """The autopilot's own numbers, new: how it flies, where its sticks end, and whether it may be flown."""

@@ -73,6 +73,10 @@ def build_parts(
     Raises ConfigError or CalibrationError.
     """
     pipeline = PipelineFactory(config, mission, calibration_file(config))
+
+    def mourn(text: str) -> None:
+        events.publish(Event(clock.now_ns(), "vision", Reason.WORKER_LOST, text))
+
     log_hz = config.recorder.image_rate_hz if config.recorder.images else 0.0
     log_hz = config.camera.rate_hz if film else log_hz
     page_hz = DASHBOARD_IMAGE_HZ if config.dashboard.enabled else 0.0
@@ -81,7 +85,7 @@ def build_parts(
         camera=build_camera(config.camera, clock),
         servo=build_servo(config.servo, open_link, clock, events),
         opener=open_link,
-        worker=ProcessWorker(pipeline, job_timeout_s=JOB_TIMEOUT_S),
+        worker=ProcessWorker(pipeline, job_timeout_s=JOB_TIMEOUT_S, on_idle_death=mourn),
         image_rate_hz=max(log_hz, page_hz),
         tell=tell,
     )

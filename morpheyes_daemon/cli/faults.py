@@ -16,6 +16,9 @@ def command(
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "320x240",
     calibration: Annotated[str, typer.Option(help="'solved', 'exact', or a calibration file.")] = "exact",
     out: Annotated[Path | None, typer.Option(help="Also write the table here, as docs/faults.md.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option(help="Keep each row in this file, and do not fly again what is in it.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON and nothing else.")] = False,
 ) -> None:
     """Fly the fault matrix in the lockstep simulator.
@@ -25,22 +28,25 @@ def command(
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.experiments.campaign import parse_seeds
     from morpheyes_daemon.experiments.fault_report import page
-    from morpheyes_daemon.experiments.fault_run import Row, choose, flights, run_matrix
+    from morpheyes_daemon.experiments.fault_run import Row, choose, flights, load_rows, run_matrix, store_row
     from morpheyes_daemon.experiments.plan import make_plan
 
     faults, wanted = choose(only), parse_seeds(seeds)
     total = flights(faults) * len(wanted)
+    known = load_rows(resume) if resume is not None else []
     done: list[Row] = []
     with progress_line() as report:
         plan = make_plan("forest", size=size, calibration=calibration, progress=report)
 
         def show(row: Row) -> None:
             done.append(row)
+            if resume is not None:
+                store_row(resume, row)
             report(f"{row.fault}, {row.state}", len(done), total)
             if not row.passed:
                 typer.echo(f"{row.fault} in {row.state}, seed {row.seed}: {'; '.join(row.complaints)}", err=True)
 
-        rows = run_matrix(plan, faults, wanted, jobs, show)
+        rows = run_matrix(plan, faults, wanted, jobs, show, known)
     text = page(rows, wanted, f"--seeds {seeds} --size {size} --calibration {calibration}")
     if out is not None:
         out.write_text(text, encoding="utf-8")

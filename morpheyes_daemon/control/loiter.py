@@ -161,13 +161,11 @@ class LoiterModel:
             p.LOIT_BRK_DELAY.read(parameters),
             p.VELOCITY_P.read(parameters) / 2.0,
         )
-        limit = p.LOIT_SPEED.read(parameters)
-        if not (limit > 0.0 and lean_max > 0.0 and up > 0.0 and brake.jerk_m_s3 > 0.0):
-            raise DeviceError("LOIT_SPEED, LOIT_BRK_JERK, ANGLE_MAX and PILOT_SPEED_UP must be positive: set them.")
+        limit, rate = p.LOIT_SPEED.read(parameters), p.PILOT_Y_RATE.read(parameters)
         on_flow = round(p.VELOCITY_SOURCE.read(parameters)) == p.OPTICAL_FLOW
         flow = max(0.0, p.FLOW_RATE.read(parameters) - 1.0) if on_flow else None
+        _require_plausible(limit, lean_max, throttle, rate, brake)
         table = _stopping_table(tuple(_limit_grid(limit) if on_flow else [limit]), lean_max, brake)
-        rate = p.PILOT_Y_RATE.read(parameters)
         return cls(axes[0], axes[1], throttle, axes[3], limit, lean_max, rate, flow, brake, table)
 
     @property
@@ -250,6 +248,27 @@ class LoiterModel:
     def speed_for_distance_m(self, distance_m: float, height_m: float, reaction_s: float = 0.0) -> float:
         """Return the largest speed from which the vehicle stops within `distance_m`; 0 when none does."""
         return self._stopping.speed_m_s(distance_m, self.limit_m_s(height_m), reaction_s)
+
+
+def _require_plausible(
+    limit_m_s: float, lean_rad: float, throttle: ThrottleAxis, yaw_rad_s: float, brake: Brake
+) -> None:
+    """Raise DeviceError for what no vehicle flies with; the bounds lie well outside of ArduCopter's own."""
+    rows = (
+        ("LOIT_SPEED", limit_m_s, 0.1, 100.0, "m/s"),
+        ("LOIT_ANG_MAX, or two thirds of ANGLE_MAX,", lean_rad, 0.01, 1.5, "rad"),
+        ("LOIT_BRK_ACCEL", brake.accel_m_s2, 0.0, 100.0, "m/s2"),
+        ("LOIT_BRK_JERK", brake.jerk_m_s3, 0.1, 1000.0, "m/s3"),
+        ("LOIT_BRK_DELAY", brake.delay_s, 0.0, 10.0, "s"),
+        ("half of PSC_VELXY_P", brake.gain_1_s, 0.01, 100.0, "1/s"),
+        ("PILOT_SPEED_UP", throttle.up_m_s, 0.01, 100.0, "m/s"),
+        ("PILOT_SPEED_DN", throttle.down_m_s, 0.01, 100.0, "m/s"),
+        ("THR_DZ", throttle.dead_band, 0.0, 0.45, "of the stick's range"),
+        ("PILOT_Y_RATE", yaw_rad_s, 0.01, 100.0, "rad/s"),
+    )
+    for name, value, low, high, unit in rows:
+        if not low <= value <= high:
+            raise DeviceError(f"{name} means {value:g} {unit}, which is not from {low:g} to {high:g}: set it right.")
 
 
 def _mapped_axes(parameters: Mapping[str, float]) -> tuple[StickAxis, StickAxis, StickAxis, StickAxis]:

@@ -12,7 +12,7 @@ import math
 import os
 import tempfile
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -73,61 +73,88 @@ def flights(faults: tuple[Fault, ...]) -> int:
 
 
 def run_matrix(
-    plan: FlightPlan, faults: tuple[Fault, ...], seeds: tuple[int, ...], jobs: int, done: Callable[[Row], None]
+    plan: FlightPlan,
+    faults: tuple[Fault, ...],
+    seeds: tuple[int, ...],
+    jobs: int,
+    done: Callable[[Row], None],
+    known: Iterable[Row] = (),
 ) -> list[Row]:
-    """Fly every fault in every state that it can happen in, at every seed; `done` hears of each row."""
+    """Fly every fault in every state that it can happen in, at every seed; `done` hears of each row.
+
+    What is `known` from before is not flown again.
+    """
     cv2.setNumThreads(1)  # a pool of threads would not survive the fork
     watched = plan.config.autopilot.model_copy(update={"watch_gcs": True})
     plan = replace(plan, config=plan.config.model_copy(update={"autopilot": watched}))
-    rows: list[Row] = []
+    names = {fault.name for fault in faults}
+    rows = {(row.fault, row.state, row.seed): row for row in known if row.fault in names and row.seed in seeds}
+
+    def note(row: Row) -> None:
+        rows[row.fault, row.state, row.seed] = row
+        done(row)
+
     for seed in seeds:
-        seeded = with_seed(plan, seed)
-        for fault in faults:
-            if fault.rig_seed != 0:
-                rows += _fly_alone(seeded, fault, done)
         for state in STATES:
-            shared = [fault for fault in faults if fault.rig_seed == 0 and state in fault.endings]
-            if shared:
-                rows += run_virtual(_fly_state(seeded, state, shared, jobs, done))
+            waiting = [fault for fault in faults if state in fault.endings and (fault.name, state, seed) not in rows]
+            _fly_seed(with_seed(plan, seed), state, waiting, jobs, note)
     order = {fault.name: number for number, fault in enumerate(FAULTS)}
-    return sorted(rows, key=lambda row: (order[row.fault], STATES.index(State(row.state)), row.seed))
+    return sorted(rows.values(), key=lambda row: (order[row.fault], STATES.index(State(row.state)), row.seed))
 
 
-def _fly_alone(plan: FlightPlan, fault: Fault, done: Callable[[Row], None]) -> list[Row]:
+def load_rows(path: Path) -> list[Row]:
+    """Return the rows that a run before has left in a file, one JSON object a line; none when there is no file."""
+    if not path.exists():
+        return []
+    return [_row_of(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+
+
+def store_row(path: Path, row: Row) -> None:
+    """Append a row to the file."""
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(asdict(row)) + "\n")
+
+
+def _row_of(text: str) -> Row:
+    values = json.loads(text)
+    return Row(**{**values, "complaints": tuple(values["complaints"])})
+
+
+def _fly_seed(plan: FlightPlan, state: State, faults: list[Fault], jobs: int, done: Callable[[Row], None]) -> None:
+    shared = [fault for fault in faults if fault.rig_seed == 0]
+    for fault in faults:
+        if fault.rig_seed != 0:
+            _fly_alone(plan, fault, done)
+    if shared:
+        run_virtual(_fly_state(plan, state, shared, jobs, done))
+
+
+def _fly_alone(plan: FlightPlan, fault: Fault, done: Callable[[Row], None]) -> None:
     """A fault that is there before the daemon starts: its calibration."""
     if fault.rig_seed is None:
         plan = replace(plan, calibration=plan.calibration.with_name("missing.yaml"))
     else:
         plan = replace(plan, scenario=replace(plan.scenario, rig_seed=fault.rig_seed))
     try:
-        return run_virtual(_fly_state(plan, State.PREFLIGHT, [fault], 1, done))
+        run_virtual(_fly_state(plan, State.PREFLIGHT, [fault], 1, done))
     except CalibrationError as error:
         refused = fault.endings[State.PREFLIGHT] is Ending.REFUSES
-        row = make_row(fault, State.PREFLIGHT, plan.scenario.seed, None, () if refused else (str(error),))
-        done(row)
-        return [row]
+        done(make_row(fault, State.PREFLIGHT, plan.scenario.seed, None, () if refused else (str(error),)))
 
 
 async def _fly_state(
     plan: FlightPlan, state: State, faults: list[Fault], jobs: int, done: Callable[[Row], None]
-) -> list[Row]:
+) -> None:
     running: deque[_Branch] = deque()
-    rows: list[Row] = []
-
-    def collect() -> None:
-        rows.append(running.popleft().row())
-        done(rows[-1])
-
     with tempfile.TemporaryDirectory() as folder:
         async with FaultFlight(plan, Path(folder)) as flight:
             await flight.reach(state)
             for fault in faults:
                 if len(running) == jobs:
-                    collect()
+                    done(running.popleft().row())
                 running.append(await _branch(flight, state, fault))
             while running:
-                collect()
-    return rows
+                done(running.popleft().row())
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +174,7 @@ class _Branch:
         os.waitpid(self.pid, 0)
         if not text:
             return make_row(self.fault, self.state, self.seed, None, ("the simulation died",))
-        return Row(**{**json.loads(text), "complaints": tuple(json.loads(text)["complaints"])})
+        return _row_of(text)
 
 
 async def _branch(flight: FaultFlight, state: State, fault: Fault) -> _Branch:
@@ -170,7 +197,7 @@ async def _branch(flight: FaultFlight, state: State, fault: Fault) -> _Branch:
 
 async def _try(flight: FaultFlight, state: State, fault: Fault) -> Row:
     loop = asyncio.get_running_loop()
-    watching = asyncio.create_task(flight.measure(fault.watch_s))
+    watching = asyncio.create_task(flight.measure(fault.watched_s(state)))
     await asyncio.sleep(0)
     fault.begin(flight)
     if fault.lasts_s is not None:

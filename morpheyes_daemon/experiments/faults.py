@@ -30,6 +30,9 @@ FRAME_S, DEPTH_S, LINK_S, VEHICLE_S, SWITCH_S = 0.6, 0.7, 0.5, 0.3, 0.5
 HEARTBEAT_S, RC_S, STATUS_S, PICTURE_S = 0.1, 0.05, 0.5, 0.3
 """Periods of the messages, and of a picture with its matching."""
 
+SETTLED_S = 4.0
+"""After a fault was noticed: neutral for two seconds, a release repeated for one, and some."""
+
 STILL_S = 0.1
 """A stream whose last message is older than this has ended."""
 
@@ -67,6 +70,11 @@ class Fault:
     watch_s: float = 7.0
     falls: bool = False
     rig_seed: int | None = 0
+
+    def watched_s(self, state: State) -> float:
+        """How long to look on: less where nothing moves that would have to stop."""
+        settled_s = self.notice_s + (self.lasts_s or 0.0) + SETTLED_S
+        return self.watch_s if state in (State.ENGAGED, State.BRAKING) else min(self.watch_s, settled_s)
 
     @property
     def kind(self) -> str:
@@ -311,7 +319,7 @@ def _resumes(fault: Fault, state: State, seen: Measured) -> Complaints:
 def _holds(fault: Fault, state: State, seen: Measured) -> Complaints:
     yield from _reacted(fault, state, seen.quiet_s)
     yield from _in(seen, State.HOLD)
-    still = seen.last is Sent.NEUTRAL and seen.last_s is not None and seen.last_s > fault.watch_s - STILL_S
+    still = seen.last is Sent.NEUTRAL and seen.last_s is not None and seen.last_s > fault.watched_s(state) - STILL_S
     yield from _expect(still, "does not hold the sticks neutral")
     yield from _expect(seen.stopped, "still moves")
 

@@ -47,7 +47,7 @@ class ProcessWorker(Generic[Job, Result]):
     """A `VisionWorker` that builds `factory()` in another process and calls its `perceive` there.
 
     `factory` and what it needs must be picklable, jobs and results too. A MorphEyesError raised there is raised here
-    as it is, anything else as WorkerFailed.
+    as it is, anything else as WorkerFailed. `on_idle_death` hears of a death that no job would tell of.
     """
 
     def __init__(
@@ -57,9 +57,11 @@ class ProcessWorker(Generic[Job, Result]):
         job_timeout_s: float,
         start_timeout_s: float = 60.0,
         niceness: int = 5,
+        on_idle_death: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._factory, self._niceness = factory, niceness
         self._job_timeout_s, self._start_timeout_s = job_timeout_s, start_timeout_s
+        self._on_idle_death = on_idle_death
         self._turn = asyncio.Lock()
         self._child: _Child | None = None
         self._starting: asyncio.Task[_Child] | None = None
@@ -134,12 +136,17 @@ class ProcessWorker(Generic[Job, Result]):
             raise WorkerLost("The vision worker took too long to start and was killed.") from None
         else:
             self._child = child
-            child.on_exit(lambda: self._lose(child))
+            child.on_exit(lambda: self._mourn(child))
             return child
         finally:
             if self._child is not child:
                 child.kill()
                 await child.close()
+
+    def _mourn(self, child: _Child) -> None:
+        if self._child is child and not self._turn.locked() and not self._closed:
+            self._on_idle_death(f"The vision worker died while idle ({child.cause}); a new one is being started.")
+        self._lose(child)
 
     def _lose(self, child: _Child) -> None:
         """Kill a child that is of no more use and begin to start another."""
@@ -241,6 +248,11 @@ class _Child:
                 await self._exited.wait()
         except TimeoutError:
             return "it closed its socket"
+        return self.cause
+
+    @property
+    def cause(self) -> str:
+        """How the process ended, once it has."""
         assert self._exit_code is not None
         killed = self._exit_code < 0
         return f"killed by {signal.Signals(-self._exit_code).name}" if killed else f"exit code {self._exit_code}"

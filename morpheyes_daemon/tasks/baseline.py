@@ -7,7 +7,6 @@ from morpheyes_daemon.clock import Clock, Ticker
 from morpheyes_daemon.control.baseline import BaselineModel
 from morpheyes_daemon.control.baseline_planner import BaselinePlanner
 from morpheyes_daemon.devices.servo import Servo
-from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
 RATE_HZ = 10.0
@@ -39,10 +38,7 @@ async def baseline(
 
 
 async def _move(servo: Servo, model: BaselineModel, target_m: float, clock: Clock) -> None:
-    sent_ns = clock.now_ns()
-    try:
-        await servo.move(target_m)
-    except DeviceError:
-        model.doubt(target_m, sent_ns)
-        raise
+    """Between sending a target and its acknowledgement the eyes may have begun to move, or not."""
+    model.doubt(target_m, clock.now_ns())
+    await servo.move(target_m)
     model.command(target_m, clock.now_ns())

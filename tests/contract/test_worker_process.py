@@ -121,20 +121,24 @@ async def test_a_worker_that_dies_at_work_is_replaced() -> None:
         (Order("crash", signal.SIGSEGV), "killed by SIGSEGV"),
         (Order("leave", 3), "exit code 3"),
     ]
-    async with worker() as w:
+    told: list[str] = []
+    async with worker(on_idle_death=told.append) as w:
         for number, (order, end) in enumerate(deaths):
             with pytest.raises(WorkerLost, match=end):
                 await w.compute(order)
             assert await w.compute(Order("count")) == 1
             assert w.restarts == number + 1
+    assert told == []  # who waited for the job has been told by its exception
 
 
-async def test_a_worker_killed_while_idle_is_replaced_unasked() -> None:
-    async with worker() as w:
+async def test_a_worker_killed_while_idle_is_replaced_unasked_and_told_of() -> None:
+    told: list[str] = []
+    async with worker(on_idle_death=told.append) as w:
         pid = w.pid
         assert pid is not None
         os.kill(pid, signal.SIGKILL)
         await until(lambda: w.pid not in (pid, None))
+        assert told == ["The vision worker died while idle (killed by SIGKILL); a new one is being started."]
         assert w.restarts == 1
         assert await w.compute(Order("count")) == 1
 

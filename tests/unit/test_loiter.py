@@ -99,9 +99,17 @@ def test_missing_parameter_is_named(name: str) -> None:
         LoiterModel.from_parameters(parameters)
 
 
-@pytest.mark.parametrize(
-    "changes", [{"RC1_TRIM": 1000}, {"RC4_MIN": 2000}, {"RCMAP_YAW": 5}, {"LOIT_SPEED": 0}, {"RCMAP_YAW": 3}]
-)
+IMPOSSIBLE = [
+    *({"RC1_TRIM": 1000}, {"RC4_MIN": 2000}, {"RCMAP_YAW": 5}, {"RCMAP_YAW": 3}),
+    *({"LOIT_SPEED": speed} for speed in (0, -500, 1e-40, 3e38)),
+    *({"LOIT_ANG_MAX": angle} for angle in (1e-40, 90, -20, 3e38)),
+    *({"LOIT_BRK_ACCEL": -250}, {"LOIT_BRK_JERK": 0}, {"LOIT_BRK_DELAY": -1}),
+    *({"PSC_VELXY_P": gain} for gain in (0, -0.0, 1e-40, -2)),
+    *({"PILOT_SPEED_UP": 0}, {"PILOT_SPEED_DN": 1e-40}, {"THR_DZ": 500}, {"PILOT_Y_RATE": 0}),
+]
+
+
+@pytest.mark.parametrize("changes", IMPOSSIBLE, ids=str)
 def test_impossible_parameters_are_refused(changes: dict[str, float]) -> None:
     with pytest.raises(DeviceError):
         LoiterModel.from_parameters(copter_parameters(**changes))
