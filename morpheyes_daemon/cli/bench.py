@@ -143,7 +143,7 @@ def _plan(size: str, calibration: str, rate_hz: float, minutes: float) -> Flight
             calibration=calibration,
             rate_hz=rate_hz,
             limit_s=minutes * 60.0 + 300.0,
-            render_threads=2,
+            threads=2,
             progress=report,
         )
 

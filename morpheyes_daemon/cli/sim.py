@@ -66,7 +66,7 @@ def command(
             wind_m_s=wind_m_s,
             latency_ms=latency_ms,
             limit_s=limit_s,
-            render_threads=2,
+            threads=2,
             progress=report,
         )
     folder = out or Path("out") / f"{plan.mission_name}-{seed}"

@@ -75,7 +75,7 @@ class Rig:
     def __init__(self, plan: FlightPlan) -> None:
         loop = VirtualLoop()
         self._loop = loop
-        self._stage = Stage(plan.scenario, plan.config, VirtualClock(loop), plan.render_threads)
+        self._stage = Stage(plan.scenario, plan.config, VirtualClock(loop), plan.threads)
 
     def pair(self, k: int) -> RawPair:
         """Render the k-th pair of the course."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -48,7 +49,7 @@ class FlightPlan:
     calibration: Path
     scenario: Scenario
     limit_s: float = 180.0
-    render_threads: int = 1
+    threads: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,17 +134,18 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     clock = running_clock()
     began_ns = clock.now_ns()
     topics, events = Topics.create(), EventLog()
-    stage = Stage(plan.scenario, plan.config, clock, plan.render_threads)
+    stage = Stage(plan.scenario, plan.config, clock, plan.threads)
     crew = make_crew(stage)
     opener = memory_opener(stage)
     pipeline = PipelineFactory(plan.config, plan.mission, plan.calibration)()
     latency_ns = round(plan.config.stereo.latency_ms * S / 1e3)
+    pool = ThreadPoolExecutor(1) if plan.threads > 1 else None
     parts = Parts(
         clock=clock,
         camera=StageCamera(stage, plan.config.camera.rate_hz),
         servo=build_servo(plan.config.servo, opener, clock, events),
         opener=opener,
-        worker=InlineWorker(pipeline.perceive, latency_ns, clock),
+        worker=InlineWorker(pipeline.perceive, latency_ns, clock, pool),
         image_rate_hz=watchers.image_rate_hz,
     )
     daemon = Daemon(plan.config, plan.mission, parts, topics, events)
@@ -176,6 +178,8 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
             task.cancel()
         await asyncio.gather(*background, running, watching, conducting, return_exceptions=True)
         stage.close()
+        if pool is not None:
+            pool.shutdown()
     simulated_s = (clock.now_ns() - began_ns) / S
     return summarize_flight(plan, verdict, tally, simulated_s, stopwatch_s() - started_s)
 

@@ -29,7 +29,7 @@ def make_plan(
     wind_m_s: float = 2.0,
     latency_ms: float | None = None,
     limit_s: float = 180.0,
-    render_threads: int = 1,
+    threads: int = 1,
     progress: Progress = silent,
 ) -> FlightPlan:
     """Return the plan of one simulated flight; raises UsageError, ConfigError or CalibrationError."""
@@ -50,7 +50,7 @@ def make_plan(
         calibration=path,
         scenario=Scenario(place, seed, wind_m_s=wind_m_s),
         limit_s=limit_s,
-        render_threads=render_threads,
+        threads=threads,
     )
 
 
@@ -92,14 +92,15 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def calibration_file(kind: str, progress: Progress = silent) -> Path:
     """Return the calibration file to fly with: solved (made once and kept), exact, or a path."""
-    from morpheyes_daemon.experiments.solved_rig import default_cache, solved_rig_file
+    from morpheyes_daemon.experiments.solved_rig import solved_rig_file
+    from morpheyes_daemon.simulation.kept import cache_folder
 
     if kind == "solved":
         return solved_rig_file(0, progress=progress)
     if kind == "exact":
         from morpheyes_daemon.simulation.rig_twin import RigTwin
 
-        path = default_cache() / "exact.yaml"
+        path = cache_folder("calibration") / "exact.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         RigTwin(640, 480, 0).exact_rig().save(path)
         return path

@@ -208,7 +208,7 @@ async def realtime_daemon(
     clock, topics, events = running_clock(), Topics.create(), EventLog()
     with tempfile.TemporaryDirectory(prefix="morpheyes-") as place:
         address = f"unix:{place}/frames"
-        job = SimulatorJob(plan.scenario, plan.config, address, plan.limit_s, plan.render_threads, autopilot)
+        job = SimulatorJob(plan.scenario, plan.config, address, plan.limit_s, plan.threads, autopilot)
         async with simulator_process(job, progress) as simulator:
             ready = await simulator.get_ready()
             config = device_config(plan, ready, address)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from morpheyes_daemon.calibration.result import rig_model
@@ -10,6 +9,7 @@ from morpheyes_daemon.calibration.solver import calibrate
 from morpheyes_daemon.calibration.views import Progress, silent
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.experiments.rendered_boards import DEFAULT_BOARD, observe_twin, twin_name
+from morpheyes_daemon.simulation.kept import cache_folder
 from morpheyes_daemon.stereo.rig import RigModel
 
 _SIZE = (640, 480)
@@ -23,7 +23,7 @@ def solved_rig_file(seed: int, cache_dir: Path | None = None, progress: Progress
 
     The rig model serves other sizes of the same shape. A file that is damaged is made again.
     """
-    folder = default_cache() if cache_dir is None else cache_dir
+    folder = cache_folder("calibration") if cache_dir is None else cache_dir
     path = folder / f"{twin_name(seed, _SIZE)}-v{_METHOD}.yaml"
     if not _readable(path):
         solve_twin(seed, progress).save(path)
@@ -38,12 +38,6 @@ def solve_twin(seed: int, progress: Progress = silent) -> RigModel:
         "board": {"board": DEFAULT_BOARD.label, "square_mm": DEFAULT_BOARD.square_m * 1e3},
     }
     return rig_model(calibrate(observations, progress), details)
-
-
-def default_cache() -> Path:
-    """Return the folder for such files in the user's cache (XDG_CACHE_HOME)."""
-    root = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(root) / "morpheyes" / "calibration"
 
 
 def _readable(path: Path) -> bool:

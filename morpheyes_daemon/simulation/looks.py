@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 
 from morpheyes_daemon.simulation import textures
+from morpheyes_daemon.simulation.kept import kept_texture
 from morpheyes_daemon.simulation.scene import Material, Mesh
 from morpheyes_daemon.simulation.textures import Texture
 
@@ -49,5 +51,10 @@ def materials_of(meshes: Iterable[Mesh], own: Mapping[str, Material]) -> dict[st
 def textures_of(materials: Iterable[Material], own: Mapping[str, Texture]) -> dict[str, Texture]:
     """Return the textures that materials are made of, from the world's `own` first."""
     names = dict.fromkeys(n for m in materials for n in (m.texture, m.modulation) if n is not None)
-    return {name: own[name] if name in own else TEXTURES[name]() for name in names}
+    return {name: own[name] if name in own else _texture(name) for name in names}
+
+
+@cache
+def _texture(name: str) -> Texture:
+    return kept_texture(name, TEXTURES[name])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import cache, lru_cache
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,6 @@ def frustum(base: Array, top: Array, radius_base_m: float, radius_top_m: float, 
     return vertices, uv, np.concatenate([ring, ring]), quads.astype(np.int32)
 
 
-@lru_cache
 @cache
 def _circle(sides: int) -> Array:
     """Cosine and sine (sides + 1, 2) once around; the last is the first, to the bit."""

@@ -35,7 +35,7 @@ class Texture:
         value[..., :3] *= value[..., :3]
         chain = [_blocks(self.texels)]
         while value.shape[0] > BLOCK:
-            value = 0.25 * (value[::2, ::2] + value[1::2, ::2] + value[::2, 1::2] + value[1::2, 1::2])
+            value = cv2.resize(value, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
             encoded = value.copy()
             encoded[..., :3] = np.sqrt(encoded[..., :3])
             chain.append(_blocks(np.rint(encoded).astype(np.uint8)))
@@ -78,19 +78,6 @@ def _blocks(level: Texels) -> NDArray[np.uint64]:
     n = level.shape[0] // BLOCK
     packed = level.astype("<u2").view("<u8").reshape(n, BLOCK, n, BLOCK)
     return packed.transpose(0, 2, 1, 3).reshape(-1).astype(np.uint64)
-
-
-def _mip_chain(texture: Texture) -> list[Texels]:
-    """Halve down to one block; colours are averaged linearly."""
-    value = texture.texels.astype(np.float32)
-    value[..., :3] **= 2
-    chain = [texture.texels]
-    while value.shape[0] > BLOCK:
-        value = 0.25 * (value[::2, ::2] + value[1::2, ::2] + value[::2, 1::2] + value[1::2, 1::2])
-        encoded = value.copy()
-        encoded[..., :3] **= 0.5
-        chain.append(np.rint(encoded).astype(np.uint8))
-    return chain
 
 
 def noise(
