@@ -41,6 +41,18 @@ def _cubic(t: Any) -> tuple[Any, Any, Any, Any]:
     )
 
 
+@inlined
+def _along(radiance: Any, row: int, column: int, w: tuple[Any, Any, Any, Any]) -> tuple[Any, Any, Any]:
+    """Return the weighted sum (blue, green, red) of four neighbours in a row."""
+    y, x0, x1 = np.uint64(row), np.uint64(column - 1), np.uint64(column)
+    x2, x3 = np.uint64(column + 1), np.uint64(column + 2)
+    return (
+        w[0] * radiance[y, x0, 0] + w[1] * radiance[y, x1, 0] + w[2] * radiance[y, x2, 0] + w[3] * radiance[y, x3, 0],
+        w[0] * radiance[y, x0, 1] + w[1] * radiance[y, x1, 1] + w[2] * radiance[y, x2, 1] + w[3] * radiance[y, x3, 1],
+        w[0] * radiance[y, x0, 2] + w[1] * radiance[y, x1, 2] + w[2] * radiance[y, x2, 2] + w[3] * radiance[y, x3, 2],
+    )
+
+
 @kernel
 def develop(
     radiance: Any, lens_map: Any, vignette: Any, gain: Any, shot: Any, read: Any, noise: Any, key: Any, image: Any
@@ -64,17 +76,17 @@ def develop(
             wx = _cubic(x - np.float32(x0))
             wy = _cubic(y - np.float32(y0))
             light = gain * vignette[row, column]
+            b0, g0, r0 = _along(radiance, y0 - 1, x0, wx)
+            b1, g1, r1 = _along(radiance, y0, x0, wx)
+            b2, g2, r2 = _along(radiance, y0 + 1, x0, wx)
+            b3, g3, r3 = _along(radiance, y0 + 2, x0, wx)
+            bgr = (
+                wy[0] * b0 + wy[1] * b1 + wy[2] * b2 + wy[3] * b3,
+                wy[0] * g0 + wy[1] * g1 + wy[2] * g2 + wy[3] * g3,
+                wy[0] * r0 + wy[1] * r1 + wy[2] * r2 + wy[3] * r3,
+            )
             for c in range(3):
-                total = zero
-                for j in range(4):
-                    v = np.uint64(y0 - 1 + j)
-                    total += wy[j] * (
-                        wx[0] * radiance[v, np.uint64(x0 - 1), c]
-                        + wx[1] * radiance[v, np.uint64(x0), c]
-                        + wx[2] * radiance[v, np.uint64(x0 + 1), c]
-                        + wx[3] * radiance[v, np.uint64(x0 + 2), c]
-                    )
-                signal = min(max(light * total, zero), one)
+                signal = min(max(light * bgr[c], zero), one)
                 value = signal + math.sqrt(shot * signal + read) * noise[(at + 3 * column + c) & mask]
                 value = min(max(value, zero), one)
                 image[row, column, c] = np.uint8(np.float32(255.0) * math.sqrt(value) + np.float32(0.5))

@@ -25,6 +25,11 @@ SAMPLES: NDArray[np.float64] = np.array(
 )
 """Offsets (x, y) in pixels of the samples of a pixel: its centre, then a rotated grid."""
 
+COUNT = len(SAMPLES)
+
+REACH_PX = 0.375
+"""Farthest that a sample lies from the centre, along x or y."""
+
 TILE = 8
 """Edge in pixels of the tiles for which the farthest sample is known."""
 
@@ -101,21 +106,12 @@ def _set_up(q: Any, a: int, b: int, c: int, attributes: Any, v0: int, two_sided:
 
 
 @inlined
-def _fill(buffer: Any, s: int, row: int, x0: int, x1: int, value: Any, step: Any, index: int) -> None:
-    """Put a span of growing or shrinking 1/z into one row of a sample plane where it is nearest."""
-    low = np.uint64(index)
-    for x in range(x0, x1):
-        key = np.uint64(np.float32(value + step * np.float32(x - x0)).view(np.uint32)) << np.uint64(32) | low
-        if key > buffer[s, row, np.uint64(x)]:
-            buffer[s, row, np.uint64(x)] = key
-
-
-@inlined
 def _scan(
-    xa: float, ya: float, xb: float, yb: float, xc: float, yc: float, records: Any, i: int, samples: Any, buffer: Any
-) -> None:
-    """Scan-convert a triangle given in pixels into every sample plane, keeping what is nearest."""
-    planes, height, width = buffer.shape
+    xa: float, ya: float, xb: float, yb: float, xc: float, yc: float, records: Any, i: int, samples: Any, buffer: Any,
+    low: Any, high: Any, start: Any,
+) -> None:  # fmt: skip
+    """Scan-convert a triangle given in pixels, keeping what is nearest; low, high, start (samples,) are scratch."""
+    height, width, _ = buffer.shape
     if ya > yb:
         xa, ya, xb, yb = xb, yb, xa, ya
     if yb > yc:
@@ -129,37 +125,49 @@ def _scan(
     slope_ab = (xb - xa) / (yb - ya) if yb > ya else 0.0
     slope_bc = (xc - xb) / (yc - yb) if yc > yb else 0.0
     b_is_right = xa + (yb - ya) * slope_ac < xb
+    for row in range(math.ceil(max(ya - REACH_PX, 0.0)), math.ceil(min(yc + REACH_PX, float(height)))):
+        left, right = np.inf, -np.inf
+        for s in range(COUNT):
+            y = row + samples[s, 1]
+            one = xa + (y - ya) * slope_ac - samples[s, 0]
+            other = (xa + (y - ya) * slope_ab if y < yb else xb + (y - yb) * slope_bc) - samples[s, 0]
+            within = (y >= ya) & (y < yc)
+            low[s] = (one if b_is_right else other) if within else np.inf
+            high[s] = (other if b_is_right else one) if within else -np.inf
+            left, right = min(left, low[s]), max(right, high[s])
+        x0, x1 = math.ceil(max(left, 0.0)), math.ceil(min(right, float(width)))
+        if x0 < x1:
+            _fill(x0, x1, row, records, i, samples, buffer, low, high, start)
+
+
+@inlined
+def _fill(
+    x0: int, x1: int, row: int, records: Any, i: int, samples: Any, buffer: Any, low: Any, high: Any, start: Any
+) -> None:
+    """Put growing or shrinking 1/z into the pixels x0..x1 of a row, at samples between low and high, where nearest."""
     dx, dy, c = records[i, 0], records[i, 1], records[i, 2]
-    wide, high = float(width), float(height)
-    for s in range(planes):
-        ox, oy = samples[s, 0], samples[s, 1]
-        first = math.ceil(min(max(ya - oy, 0.0), high))
-        middle = math.ceil(min(max(yb - oy, 0.0), high))
-        last = math.ceil(min(max(yc - oy, 0.0), high))
-        for row in range(first, last):
-            y = row + oy
-            left = xa + (y - ya) * slope_ac
-            right = xa + (y - ya) * slope_ab if row < middle else xb + (y - yb) * slope_bc
-            if not b_is_right:
-                left, right = right, left
-            x0 = math.ceil(max(left - ox, 0.0))
-            x1 = math.ceil(min(right - ox, wide))
-            if x0 < x1:
-                start = np.float32(dx * (x0 + ox) + dy * y + c)
-                _fill(buffer, s, row, x0, x1, start, np.float32(dx), i)
+    for s in range(COUNT):
+        start[s] = dx * (x0 + samples[s, 0]) + dy * (row + samples[s, 1]) + c
+    step, index, line = np.float32(dx), np.uint64(i), np.uint64(row)
+    for x in range(x0, x1):
+        at, gone, column = float(x), np.float32(x - x0), np.uint64(x)
+        for s in range(COUNT):
+            key = np.uint64(np.float32(start[s] + step * gone).view(np.uint32)) << np.uint64(32) | index
+            if (at >= low[s]) & (at < high[s]) & (key > buffer[line, column, s]):
+                buffer[line, column, s] = key
 
 
 @inlined
 def _farthest_in(buffer: Any, top: int, left: int) -> Any:
     """Return the smallest 1/z in a tile, 0 if one of its samples is empty."""
-    planes, height, width = buffer.shape
-    smallest = buffer[0, top, left]
-    for s in range(planes):
-        for row in range(top, min(top + TILE, height)):
-            for column in range(left, min(left + TILE, width)):
-                smallest = min(smallest, buffer[s, np.uint64(row), np.uint64(column)])
-            if smallest == np.uint64(0):
-                return np.float32(0.0)
+    height, width, _ = buffer.shape
+    smallest = buffer[top, left, 0]
+    for row in range(top, min(top + TILE, height)):
+        for column in range(left, min(left + TILE, width)):
+            for s in range(COUNT):
+                smallest = min(smallest, buffer[np.uint64(row), np.uint64(column), s])
+        if smallest == np.uint64(0):
+            return np.float32(0.0)
     return np.uint32(smallest >> np.uint64(32)).view(np.float32)
 
 
@@ -251,6 +259,8 @@ def rasterise(
     farthest: Any,
     q: Any,
     polygon: Any,
+    edges: Any,
+    start: Any,
     records: Any,
     record_parts: Any,
     record_groups: Any,
@@ -260,7 +270,7 @@ def rasterise(
 
     vertices (V, 3), attributes (V, 3) = (u, v in tiles, sun), triangles (T, 3) in the batch's frame; per part:
     ranges (P, 4) = first vertex, end, first triangle, end; flags (P, 2) = two-sided, loose. q (most vertices of a
-    part, 3) and polygon (4, 2) are scratch.
+    part, 3), polygon (4, 2), edges (2, samples) and start (samples,) float32 are scratch.
     """
     drawn = 0
     for n in range(len(order)):
@@ -283,7 +293,7 @@ def rasterise(
             for corner in range(2, corners):
                 _scan(
                     polygon[0, 0], polygon[0, 1], polygon[corner - 1, 0], polygon[corner - 1, 1],
-                    polygon[corner, 0], polygon[corner, 1], records, count, samples, buffer,
+                    polygon[corner, 0], polygon[corner, 1], records, count, samples, buffer, edges[0], edges[1], start,
                 )  # fmt: skip
             count += 1
             drawn += 1

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages import FloatMap, Image, Pinhole
-from morpheyes_daemon.simulation.raster import PLANES, SAMPLES, TILE, rasterise, visible_parts
+from morpheyes_daemon.simulation.raster import COUNT, PLANES, SAMPLES, TILE, rasterise, visible_parts
 from morpheyes_daemon.simulation.scene import SKY_OBJECT, Material, Mesh, Scene
 from morpheyes_daemon.simulation.shading import shade_image
 from morpheyes_daemon.simulation.textures import Atlas, pack
@@ -85,14 +85,16 @@ class _Workspace:
         self.groups = np.full(1 + triangles, -1, np.int32)
         self.transformed = np.empty((vertices, 3))
         self.polygon = np.empty((4, 2))
-        self.sample_groups = np.empty(len(SAMPLES), np.int64)
+        self.edges = np.empty((2, COUNT))
+        self.start = np.empty(COUNT, np.float32)
+        self.sample_groups = np.empty(COUNT, np.int64)
         self._buffers: dict[tuple[int, int], tuple[NDArray[np.uint64], FloatMap]] = {}
 
     def cleared(self, shape: tuple[int, int]) -> tuple[NDArray[np.uint64], FloatMap]:
         """Return an empty visibility buffer and its tiles."""
         if shape not in self._buffers:
             tiles = (-(-shape[0] // TILE), -(-shape[1] // TILE))
-            self._buffers[shape] = np.empty((len(SAMPLES), *shape), np.uint64), np.empty(tiles, np.float32)
+            self._buffers[shape] = np.empty((*shape, COUNT), np.uint64), np.empty(tiles, np.float32)
         buffer, farthest = self._buffers[shape]
         buffer.fill(0)
         farthest.fill(0.0)
@@ -179,7 +181,7 @@ class Renderer:
             count = rasterise(
                 order, batch.vertices, batch.attributes, batch.triangles, batch.ranges, batch.flags, batch.first_part,
                 R, t, intrinsics, SAMPLES, buffer, farthest, work.transformed, work.polygon,
-                work.records, work.parts, work.groups, count,
+                work.edges, work.start, work.records, work.parts, work.groups, count,
             )  # fmt: skip
         return buffer
 

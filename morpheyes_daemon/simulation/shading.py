@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from morpheyes_daemon.simulation.kernel import inlined, kernel
+from morpheyes_daemon.simulation.raster import COUNT
 
 MAX_TAPS = 3
 """Most texture taps along the longer axis of a pixel's footprint."""
@@ -149,7 +150,7 @@ def _shade(
 def _gather(groups: Any, first: int, samples: Any) -> tuple[int, float, float]:
     """Count the samples of one group, sum up their offsets, and mark them done."""
     group, n, x, y = groups[first], 0, 0.0, 0.0
-    for s in range(first, len(groups)):
+    for s in range(first, COUNT):
         if groups[s] == group:
             groups[s] = DONE
             n += 1
@@ -161,16 +162,16 @@ def _gather(groups: Any, first: int, samples: Any) -> tuple[int, float, float]:
 @inlined
 def _is_uniform(buffer: Any, row: int, column: int, record_groups: Any, groups: Any) -> bool:
     """Tell whether all samples of a pixel see the same; if not, note the group of each."""
-    x = np.uint64(column)
+    y, x = np.uint64(row), np.uint64(column)
     difference = np.uint64(0)
-    for s in range(1, buffer.shape[0]):
-        difference |= buffer[s, row, x] ^ buffer[0, row, x]
+    for s in range(1, COUNT):
+        difference |= buffer[y, x, s] ^ buffer[y, x, 0]
     if difference & RECORD == np.uint64(0):
         groups[0] = 0
         return True
     uniform = True
-    for s in range(buffer.shape[0]):
-        groups[s] = record_groups[buffer[s, row, x] & RECORD]
+    for s in range(COUNT):
+        groups[s] = record_groups[buffer[y, x, s] & RECORD]
         uniform = uniform and groups[s] == groups[0]
     return uniform
 
@@ -202,8 +203,8 @@ def shade_image(
     texture per tile in u and v, mip levels between the two; light (4, 3) = sun, sky, haze, 1/haze range; groups
     (samples,) int64 is scratch.
     """
-    planes, height, width = buffer.shape
-    share = np.float32(1.0 / planes)
+    height, width, _ = buffer.shape
+    share = np.float32(1.0 / COUNT)
     for row in range(height):
         known, fresh_until = np.int64(-1), 0
         footprint = (0.0, 1, 0.0, 0.0)
@@ -211,14 +212,14 @@ def shade_image(
             uniform = _is_uniform(buffer, row, column, record_groups, groups)
             depth[row, column], objects[row, column] = np.inf, -1
             blue, green, red = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-            for s in range(planes):
+            for s in range(COUNT):
                 if groups[s] == DONE:
                     continue
-                n, x, y = planes, float(column), float(row)
+                n, x, y = COUNT, float(column), float(row)
                 if not uniform:
                     n, dx, dy = _gather(groups, s, samples)
                     x, y = column + dx / n, row + dy / n
-                i = np.int64(buffer[s, row, np.uint64(column)] & RECORD)
+                i = np.int64(buffer[np.uint64(row), np.uint64(column), s] & RECORD)
                 b, g, r = light[2, 0], light[2, 1], light[2, 2]
                 if i > 0:
                     part = record_parts[i]
