@@ -52,9 +52,11 @@ ALARMS = frozenset(
         Reason.BASELINE_STALE,
         Reason.SERVO_LOST,
         Reason.WORKER_LOST,
+        Reason.EYES_APART,
+        Reason.DEPTH_SCALE,
     }
 )
-"""What the devices report that ends a flight in HOLD, though they may be well again a moment later."""
+"""What devices and images tell that ends a flight in HOLD, though all may be well again a moment later."""
 
 STATE_NUMBERS: dict[State, int] = {state: number for number, state in enumerate(State)}
 """What NAMED_VALUE_INT carries for a state."""

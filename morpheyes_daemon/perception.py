@@ -12,6 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from morpheyes_daemon.calibration.ego_motion import eye_motion
+from morpheyes_daemon.calibration.scale_watch import ScaleWatch, Sight
 from morpheyes_daemon.clock import stopwatch_s
 from morpheyes_daemon.config import MissionFile, VehicleConfig
 from morpheyes_daemon.messages import (
@@ -25,7 +27,7 @@ from morpheyes_daemon.messages import (
     frozen,
 )
 from morpheyes_daemon.reasons import Reason
-from morpheyes_daemon.stereo.depth import DepthEstimator, RectifiedPair
+from morpheyes_daemon.stereo.depth import DepthEstimator, RectifiedPair, disparity_of
 from morpheyes_daemon.stereo.image_checks import AlikeCheck, FrozenCheck, ImageFault, exposure_faults, matching_faults
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import Craft, Strategy, View
@@ -33,7 +35,7 @@ from morpheyes_daemon.strategies.registry import find_strategy
 from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rpy, pose
 from morpheyes_daemon.yaml_source import validate
 
-_REASONS = {ImageFault.MISALIGNED: Reason.CALIBRATION_DRIFT}
+_REASONS = {ImageFault.MISALIGNED: Reason.CALIBRATION_DRIFT, ImageFault.APART: Reason.EYES_APART}
 """What is no fault of the images but of the rig."""
 
 SECTORS = 72
@@ -88,7 +90,7 @@ class Pipeline:
 
     def __init__(self, config: VehicleConfig, mission: MissionFile, rig: RigModel) -> None:
         self._estimator = DepthEstimator(rig, config.stereo, (config.camera.width_px, config.camera.height_px))
-        self._frozen, self._alike = FrozenCheck(), AlikeCheck()
+        self._frozen, self._alike, self._scale = FrozenCheck(), AlikeCheck(), ScaleWatch()
         self._strategy = build_strategy(mission, config)
         self._T_frd_rig = build_craft(config).T_frd_rig
 
@@ -97,7 +99,7 @@ class Pipeline:
         started_s = stopwatch_s()
         pair = self._estimator.rectified(job.frame)
         depth = self._estimator.depth(job.frame, pair)
-        faults = self._image_faults(job.frame, pair, depth)
+        faults = self._image_faults(job, pair, depth)
         view = View(depth, pair.left, pair.right, job.vehicle, self._T_frd_rig)
         percept = self._strategy.perceive(view)
         return Perception(
@@ -109,14 +111,17 @@ class Pipeline:
             depth_m=frozen(depth.depth_m[::2, ::2].copy()) if job.keep_images else None,
         )
 
-    def _image_faults(self, frame: StereoFrame, pair: RectifiedPair, depth: DepthMap) -> tuple[Reason, ...]:
+    def _image_faults(self, job: VisionJob, pair: RectifiedPair, depth: DepthMap) -> tuple[Reason, ...]:
         """Return why the frame must not be flown on, empty when it may."""
         found = exposure_faults(pair.left, pair.right)
         found |= matching_faults(pair.left, pair.right, depth.valid_fraction)
-        found |= self._alike.check(pair.left, pair.right, depth.baseline_m * depth.pinhole.f_px / depth.depth_m)
-        if self._frozen.check(frame.left, frame.right):
+        found |= self._alike.check(pair.left, pair.right, disparity_of(depth), depth.pinhole.f_px)
+        if self._frozen.check(job.frame.left, job.frame.right):
             found.add(ImageFault.FROZEN)
         reasons = {_REASONS.get(fault, Reason.IMAGE_BAD) for fault in found}
+        motion = eye_motion(job.vehicle, self._T_frd_rig, depth.T_rig_rect)
+        if self._scale.check(Sight(pair.left, depth, motion)):
+            reasons.add(Reason.DEPTH_SCALE)
         return tuple(sorted(reasons, key=lambda reason: reason.number))
 
 

@@ -54,6 +54,8 @@ class Reason(StrEnum):
     NO_FREE_PATH = "no_free_path", 61, "no free direction is in sight"
     BLIND = "blind", 62, "too few pixels have a depth"
     IMAGE_BAD = "image_bad", 63, "the images are frozen, dark, swapped or do not match"
+    DEPTH_SCALE = "depth_scale", 65, "depth does not fit the motion: the eyes are not where the servo should hold them"
+    EYES_APART = "eyes_apart", 66, "the eyes' rows stay apart: not exposed together, bent, or another rig's calibration"
     CALIBRATION_DRIFT = "calibration_drift", 64, "the eyes no longer point where the calibration says"
 
     # faults

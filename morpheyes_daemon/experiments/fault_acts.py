@@ -17,6 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.experiments import sabotage
 from morpheyes_daemon.experiments.fault_flight import FaultFlight
+from morpheyes_daemon.messages import Event
+from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.simulation.flight_modes import Mode
 from morpheyes_daemon.simulation.teensy_twin import ServoFault
 from morpheyes_daemon.supervisor.worker import WorkerFailed, WorkerLost
@@ -93,6 +95,14 @@ def crash_pipeline(flight: FaultFlight) -> None:
     flight.worker.gone = WorkerFailed("ValueError: something unforeseen")
 
 
+def kill_idle_worker(flight: FaultFlight) -> None:
+    """Between two frames, so that no job tells of it; until the next worker is ready frames wait."""
+    daemon = flight.daemon
+    text = "The vision worker died while idle (killed by SIGKILL); a new one is being started."
+    daemon.events.publish(Event(flight.clock.now_ns(), "vision", Reason.WORKER_LOST, text))
+    flight.worker.extra_ns = 500_000_000
+
+
 def mend_worker(flight: FaultFlight) -> None:
     flight.worker.gone, flight.worker.hung_s, flight.worker.extra_ns = None, None, 0
 
@@ -103,6 +113,11 @@ def mend_worker(flight: FaultFlight) -> None:
 def servo(fault: ServoFault) -> Act:
     """One of the Teensy twin's own faults."""
     return lambda flight: flight.stage.teensy.inject(fault)
+
+
+def engage(flight: FaultFlight) -> None:
+    """The pilot hands over to a daemon that has not noticed."""
+    flight.crew.engage()
 
 
 def reboot_servo(flight: FaultFlight) -> None:

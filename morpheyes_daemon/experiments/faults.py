@@ -27,6 +27,10 @@ RELEASE_S = 0.05
 FRAME_S, DEPTH_S, LINK_S, VEHICLE_S, SWITCH_S = 0.6, 0.7, 0.5, 0.3, 0.5
 """Declared times to notice: three camera periods, the same and the matcher's latency, and the time-outs."""
 
+APART_S, SCALE_S, REBOOT_S = 3.0, 4.5, 0.8
+"""Eight frames that turn or pitch; the servos' way to where depth is a third too large, five frames and latency;
+the Teensy's boot and its next STATUS."""
+
 HEARTBEAT_S, RC_S, STATUS_S, PICTURE_S = 0.1, 0.05, 0.5, 0.3
 """Periods of the messages, and of a picture with its matching."""
 
@@ -99,6 +103,7 @@ _HARMLESS = _row(E.FLIES, E.RESUMES, E.HOLDS, E.READY)
 _TAKEN = _row(E.RELEASES, E.RELEASES, E.RELEASES, None)
 _LEFT = _row(E.LETS_GO, E.LETS_GO, E.LETS_GO, E.UNREADY)
 _PERHAPS = _row(E.HOLDS_IF_IT_MATTERS, E.HOLDS_IF_IT_MATTERS, E.HOLDS, None)
+_SEEN_IN_MOTION = _row(E.HOLDS, E.HOLDS, E.HOLDS, None)
 _DEAD = _row(E.STOPS, E.STOPS, E.STOPS, E.UNREADY)
 
 FAULTS: tuple[Fault, ...] = (
@@ -145,8 +150,8 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault("image-burnt", "exposure burnt out", DEPTH_S + PICTURE_S, _STOPPED, acts.burn_out),
     Fault("desync-5ms", "the right eye 5 ms late", 0.0, _PERHAPS, acts.desynchronize(5.0)),
-    Fault("desync-20ms", "the right eye 20 ms late", 0.0, _PERHAPS, acts.desynchronize(20.0)),
-    Fault("desync-50ms", "the right eye 50 ms late", 0.0, _PERHAPS, acts.desynchronize(50.0)),
+    Fault("desync-20ms", "the right eye 20 ms late", APART_S, _SEEN_IN_MOTION, acts.desynchronize(20.0), watch_s=11.0),
+    Fault("desync-50ms", "the right eye 50 ms late", APART_S, _SEEN_IN_MOTION, acts.desynchronize(50.0), watch_s=11.0),
     # depth
     Fault("depth-slow", "each depth map 1 s late", DEPTH_S, _STOPPED, acts.slow_worker),
     Fault("depth-hung", "the matcher hangs until it is killed", DEPTH_S, _STOPPED, acts.hang_worker),
@@ -158,6 +163,15 @@ FAULTS: tuple[Fault, ...] = (
         acts.kill_worker,
         acts.mend_worker,
         0.3,
+    ),
+    Fault(
+        "depth-died-idle",
+        "the matcher dies between two frames",
+        0.0,
+        _STOPPED_THEN_WELL,
+        acts.kill_idle_worker,
+        acts.mend_worker,
+        0.5,
     ),
     Fault("depth-crashing", "the matcher raises at every frame", PICTURE_S, _STOPPED, acts.crash_pipeline),
     # calibration
@@ -180,7 +194,25 @@ FAULTS: tuple[Fault, ...] = (
         acts.servo(ServoFault.SILENT),
     ),
     Fault("servo-garbage", "the Teensy sends garbage", 1.5, _STOPPED, acts.servo(ServoFault.GARBAGE)),
-    Fault("servo-reboot", "the Teensy restarts", 0.0, _PERHAPS, acts.reboot_servo),
+    Fault(
+        "servo-runs-in",
+        "the servos run in and stay there, targets are acknowledged",
+        SCALE_S,
+        _SEEN_IN_MOTION,
+        acts.servo(ServoFault.RUNS_IN),
+        watch_s=11.0,
+    ),
+    Fault(
+        "servo-ran-in",
+        "so they did before the pilot engaged",
+        SCALE_S,
+        _row(*[None] * 3, E.HOLDS),
+        acts.servo(ServoFault.RUNS_IN),
+        acts.engage,
+        5.0,
+        watch_s=14.0,
+    ),
+    Fault("servo-reboot", "the Teensy restarts", REBOOT_S, _STOPPED_THEN_WELL, acts.reboot_servo),
     Fault("servo-wrong", "the servos go 10 mm too far", 0.0, _HARMLESS, acts.servo(ServoFault.WRONG_POSITION)),
     # link
     Fault("link-lost", "both directions silent", VEHICLE_S, _DEAD, acts.lose_link),

@@ -76,10 +76,12 @@ class ServoFault(Enum):
     STUCK = "the servos hold where they are, targets are acknowledged"
     SILENT = "the Teensy neither listens nor answers"
     GARBAGE = "the Teensy sends random bytes instead of frames"
+    RUNS_IN = "the servos run to their short end and stay there, targets are acknowledged"
     WRONG_POSITION = "the servos go 10 mm beyond every target, as far as the stroke goes"
 
 
 WRONG_BY_M = 0.010
+_DEAF = {ServoFault.STUCK, ServoFault.RUNS_IN}
 
 
 class TeensyTwin:
@@ -125,10 +127,13 @@ class TeensyTwin:
         self._faults.add(fault)
         if fault is ServoFault.STUCK:
             self._halt()
+        elif fault is ServoFault.RUNS_IN:
+            for eye in self._eyes:
+                eye.aim(self._truth.min_m / 2, self._clock.now_ns())
 
     def repair(self) -> None:
-        """End all faults; stuck servos go on to their target."""
-        was_stuck = ServoFault.STUCK in self._faults
+        """End all faults; servos that did not obey go on to their target."""
+        was_stuck = bool(_DEAF & self._faults)
         self._faults.clear()
         if was_stuck and self._target_m is not None:
             self._drive(self._target_m)
@@ -161,7 +166,7 @@ class TeensyTwin:
             self._send(Welcome(VERSION, FIRMWARE, self._truth.min_m, self._truth.max_m))
 
     def _drive(self, target_m: float) -> None:
-        if ServoFault.STUCK in self._faults:
+        if _DEAF & self._faults:
             return
         if ServoFault.WRONG_POSITION in self._faults:
             target_m = min(target_m + WRONG_BY_M, self._truth.max_m)

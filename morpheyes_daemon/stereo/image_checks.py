@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.messages import FloatMap, Image
-from morpheyes_daemon.stereo.epipolar import RowFit, RowOffsets, row_offsets
+from morpheyes_daemon.stereo.epipolar import MIN_POINTS, RowFit, RowOffsets, row_offsets
 from morpheyes_daemon.stereo.matching import MatchSettings, semi_global
 
 
@@ -37,6 +37,7 @@ class ImageFault(StrEnum):
     MISALIGNED = "misaligned", "the rows of the eyes do not align: bent rig or wrong calibration"
     DESYNCHRONIZED = "desynchronized", "the eyes do not expose at the same time"
     UNLIKE = "unlike", "the eyes do not see the same scene"
+    APART = "apart", "the rows of the eyes stay apart: not exposed together, bent, or another rig's calibration"
 
 
 MAX_SHIFT_ROWS = 12
@@ -63,6 +64,9 @@ class ImageLimits:
     alike_points: int = 60
     unlike_frames: int = 3
     unlike_of: int = 4
+    apart_rad: float = 3.2e-3
+    apart_frames: int = 5
+    apart_of: int = 8
 
 
 class FrozenCheck:
@@ -78,24 +82,29 @@ class FrozenCheck:
 
 
 class AlikeCheck:
-    """Tells eyes that see different things: too few textured places of the left are found again in the right.
+    """Tells eyes that see different things, or the same at different times, or through another calibration.
 
-    Of flights at 320x240 (forest, seeds 0 to 3) 0.44 to 0.89 of the places are found, with the eyes swapped 0.0 to
-    0.36, half of them below 0.03. One frame is no proof. How far rows are apart proves nothing without the motion:
-    2 ms between the eyes already make 1.5 px of it in a quick pitch (see `row_faults`).
+    Of flights at 320x240 (forest, seeds 0 to 3) 0.44 to 0.89 of the textured places of the left are found again in
+    the right, with the eyes swapped 0.0 to 0.36, half of them below 0.03. One frame is no proof. Nor is it for rows
+    that are apart: 2 ms between the eyes make 4 mrad in a quick pitch, in one frame of 20 of those flights; with 20
+    ms every second frame shows as much, and the calibration of another rig 5 mrad in all.
     """
 
     def __init__(self, limits: ImageLimits | None = None) -> None:
         self._limits = limits or ImageLimits()
         self._unlike: deque[bool] = deque(maxlen=self._limits.unlike_of)
+        self._apart: deque[bool] = deque(maxlen=self._limits.apart_of)
 
-    def check(self, left: Image, right: Image, disparity_px: FloatMap) -> set[ImageFault]:
-        """Look at a rectified grey pair (H, W) with its disparity (H, W), NaN unknown."""
+    def check(self, left: Image, right: Image, disparity_px: FloatMap, f_px: float) -> set[ImageFault]:
+        """Look at a rectified grey pair (H, W) with its disparity (H, W), NaN unknown, and focal length."""
         limits = self._limits
         found = row_offsets(left, right, disparity_px)
         unlike = found.tried >= limits.alike_points and found.count < limits.alike_share * found.tried
-        self._unlike.append(unlike and _textured_share(left, limits.textured_levels) > limits.textured_share)
-        return {ImageFault.UNLIKE} if sum(self._unlike) >= limits.unlike_frames else set()
+        unlike = unlike and _textured_share(left, limits.textured_levels) > limits.textured_share
+        self._unlike.append(unlike)
+        self._apart.append(unlike or (found.count >= MIN_POINTS and found.median_px > limits.apart_rad * f_px))
+        faults = {ImageFault.UNLIKE} if sum(self._unlike) >= limits.unlike_frames else set()
+        return faults | ({ImageFault.APART} if sum(self._apart) >= limits.apart_frames else set())
 
 
 def exposure_faults(left: Image, right: Image, limits: ImageLimits | None = None) -> set[ImageFault]:

@@ -14,6 +14,9 @@ from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import Gate, Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
+WORTHLESS = frozenset({Reason.IMAGE_BAD, Reason.EYES_APART, Reason.DEPTH_SCALE})
+"""Depth from images with these faults is not flown on."""
+
 
 class Worker(Protocol):
     """Where the vision pipeline runs."""
@@ -49,7 +52,7 @@ async def depth(
         for reason in (reason for reason in seen.image_faults if reason not in faults):
             events.publish(Event(clock.now_ns(), "depth", reason, reason.text))
         faults = seen.image_faults
-        if Reason.IMAGE_BAD not in faults:
+        if not WORTHLESS & set(faults):
             gate.renew(Lease.DEPTH, frame.t_ns + lease_ns)
         topics.perception.publish(seen)
         pulse.beat()

@@ -1,9 +1,10 @@
 """Changes the code of safety/ in every small way it knows, one at a time, and counts how many the tests notice.
 
-    python tests/safety/mutate.py [--jobs N] [--only MODULE] [--list]
+    python tests/safety/mutate.py [--jobs N] [--only MODULE] [--resume FILE] [--list]
 
 Mutation testers from the package index change function bodies only; here the tables are the program, so this one
-also drops rows and swaps enum members anywhere. Each mutant lives in a forked process and never on disk. Exits 1
+also drops rows and swaps enum members anywhere. Each mutant lives in a forked process and never on disk. What was
+noticed once, by the same source, need not be tried again (`--resume`); survivors are, against today's tests. Exits 1
 when fewer than 95 % are noticed or when a survivor is not explained in `EQUIVALENT`.
 """
 
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import hashlib
 import importlib
 import importlib.machinery
 import os
@@ -26,7 +28,11 @@ PACKAGE = "morpheyes_daemon.safety"
 MODULES = ("states", "switch", "concerns", "gate", "guardian")
 FAST = ("states", "switch", "concerns", "gate", "guardian", "takeover")
 SLOW = ("rules", "random_steps")
-PYTEST = ("-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+PYTEST = (
+    *("-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--assert=plain", "--disable-warnings"),
+    *("-c", os.devnull, "--rootdir", str(ROOT)),
+)
+"""Without the plug-ins and the rewriting of assertions that only serve a reader: half the time."""
 PER_MUTANT_S = 180
 """Seconds of CPU; a mutant that loops for ever has been noticed."""
 WANTED = 0.95
@@ -234,11 +240,32 @@ def _forked(mutant: Mutant, text: str) -> int:
     return pid
 
 
-def run(mutants: list[Mutant], texts: dict[str, str], jobs: int) -> list[Mutant]:
-    """Try every mutant, `jobs` at a time, and return the survivors."""
+class Noticed:
+    """The mutants noticed so far, by a line each in a file (None: not kept); a changed module counts anew."""
+
+    def __init__(self, path: Path | None, texts: dict[str, str]) -> None:
+        self._path = path
+        self._hashes = {module: hashlib.sha256(text.encode()).hexdigest()[:12] for module, text in texts.items()}
+        self._lines = set(path.read_text().splitlines()) if path is not None and path.exists() else set()
+
+    def __contains__(self, mutant: Mutant) -> bool:
+        return self._line(mutant) in self._lines
+
+    def add(self, mutant: Mutant) -> None:
+        """Keep a mutant that was noticed."""
+        if self._path is not None:
+            with self._path.open("a") as file:
+                file.write(self._line(mutant) + "\n")
+
+    def _line(self, mutant: Mutant) -> str:
+        return f"{self._hashes[mutant.module]} {mutant.node} {mutant}"
+
+
+def run(mutants: list[Mutant], texts: dict[str, str], jobs: int, noticed: Noticed) -> list[Mutant]:
+    """Try every mutant not yet noticed, `jobs` at a time, and return the survivors."""
     running: dict[int, Mutant] = {}
     survivors: list[Mutant] = []
-    waiting = list(reversed(mutants))
+    waiting = [mutant for mutant in reversed(mutants) if mutant not in noticed]
     while waiting or running:
         while waiting and len(running) < jobs:
             mutant = waiting.pop()
@@ -248,6 +275,8 @@ def run(mutants: list[Mutant], texts: dict[str, str], jobs: int) -> list[Mutant]
         if status == 0:
             survivors.append(mutant)
             print(f"\nsurvives {mutant}", file=sys.stderr)
+        else:
+            noticed.add(mutant)
         print(f"\r{len(mutants) - len(waiting) - len(running)}/{len(mutants)}", end="", file=sys.stderr)
     print(file=sys.stderr)
     return sorted(survivors, key=lambda m: (m.module, m.line))
@@ -274,6 +303,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", choices=MODULES)
+    parser.add_argument("--resume", type=Path, help="keep here what was noticed, and do not try it again")
     parser.add_argument("--list", action="store_true", help="print the mutants and try none")
     arguments = parser.parse_args()
     os.chdir(ROOT)
@@ -284,12 +314,13 @@ def main() -> int:
     if arguments.list:
         print(*mutants, sep="\n")
         return 0
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
     for preload in ("pytest", "hypothesis.stateful", "morpheyes_daemon.config", "morpheyes_daemon.messages"):
         importlib.import_module(preload)
     if _fails_unchanged(modules[0], texts[modules[0]]):
         print("The tests fail without any change: mend them first.")
         return 1
-    survivors = run(mutants, texts, arguments.jobs)
+    survivors = run(mutants, texts, arguments.jobs, Noticed(arguments.resume, texts))
     noticed = len(mutants) - len(survivors)
     unexplained = [m for m in survivors if (m.module, m.source, m.change) not in EQUIVALENT]
     for mutant in survivors:

@@ -54,7 +54,6 @@ async def pour(link: str, total: int, seed: int) -> NoisyDaemon:
     return noisy
 
 
-@pytest.mark.slow
 def test_noise_on_the_autopilots_link_moves_no_stick() -> None:
     noisy = run_virtual(pour("autopilot", 100_000, seed=1))
     assert noisy.states[State.STANDBY] > 10, "it was ready to fly for some of the time"

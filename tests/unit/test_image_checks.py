@@ -134,32 +134,55 @@ def test_every_fault_says_what_it_is():
     assert all(fault.text and fault.value for fault in ImageFault)
 
 
+F_PX = 372.0
+"""Of the simulator's eyes at 320 pixels: two rows are 5.4 mrad."""
+
+
 def disparity(left, right):
     return match(left, right, 80).disparity_px
 
 
 def test_eyes_that_see_the_same_are_alike(pair):
     check = AlikeCheck()
-    assert [check.check(*pair, disparity(*pair)) for _ in range(6)] == [set()] * 6
+    assert [check.check(*pair, disparity(*pair), F_PX) for _ in range(6)] == [set()] * 6
 
 
 def test_eyes_that_see_different_things_are_told_after_three_frames(pair):
     left, right = pair
     wrong = disparity(left, right) + 12
     check = AlikeCheck()
-    assert [check.check(left, right, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.UNLIKE}] * 2
-    assert check.check(left, right, disparity(left, right)) == {ImageFault.UNLIKE}
-    assert check.check(left, right, disparity(left, right)) == set(), "two good frames clear it"
+    assert [check.check(left, right, wrong, F_PX) for _ in range(4)] == [set(), set()] + [{ImageFault.UNLIKE}] * 2
+    assert check.check(left, right, disparity(left, right), F_PX) == {ImageFault.UNLIKE}
+    assert check.check(left, right, disparity(left, right), F_PX) == set(), "two good frames clear it"
 
 
-def test_rows_apart_alone_are_not_unlike(pair):
+def test_a_row_apart_is_no_fault(pair):
     left, right = pair
     apart = np.roll(right, 1, axis=0)
     check = AlikeCheck()
-    assert [check.check(left, apart, disparity(left, apart)) for _ in range(6)] == [set()] * 6
+    assert [check.check(left, apart, disparity(left, apart), F_PX) for _ in range(9)] == [set()] * 9
+
+
+def test_rows_that_stay_apart_are_told_after_five_frames(pair):
+    left, right = pair
+    apart, wrong, good = np.roll(right, 2, axis=0), disparity(left, right), (left, right, disparity(left, right), F_PX)
+    check = AlikeCheck()
+    found = [check.check(left, apart, wrong, F_PX) for _ in range(6)]
+    assert found == [set()] * 4 + [{ImageFault.APART}] * 2
+    assert [check.check(*good) for _ in range(4)] == [{ImageFault.APART}] * 3 + [set()], "four bad frames of eight"
+
+
+def test_rows_apart_for_a_moment_are_no_fault(pair):
+    """As in a quick pitch, where 2 ms between the eyes show."""
+    left, right = pair
+    apart, depth = np.roll(right, 2, axis=0), disparity(left, right)
+    check = AlikeCheck()
+    for _ in range(3):
+        assert [check.check(left, apart, depth, F_PX) for _ in range(4)] == [set()] * 4
+        assert [check.check(left, right, depth, F_PX) for _ in range(8)] == [set()] * 8
 
 
 def test_a_bare_wall_is_no_fault():
     rng = np.random.default_rng(1)
     left, right = (rng.normal(120, 1.0, (240, 320)).round().astype(np.uint8) for _ in range(2))
-    assert AlikeCheck().check(left, right, np.full((240, 320), 5.0, np.float32)) == set()
+    assert AlikeCheck().check(left, right, np.full((240, 320), 5.0, np.float32), F_PX) == set()
