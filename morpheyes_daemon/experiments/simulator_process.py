@@ -126,7 +126,10 @@ async def _simulate(job: SimulatorJob, pipe: Connection) -> None:
     clock = running_clock()
     if job.sitl is not None:
         async with open_sitl(job.sitl, clock) as (vehicle, crew):
-            stage = Stage(job.scenario, job.config, clock, job.render_threads, vehicle)
+            # in a thread, since the SITL goes on talking
+            stage = await asyncio.to_thread(
+                Stage, job.scenario, job.config, clock, job.render_threads, vehicle
+            )
             vehicle.stand_at(*stage.world.start_ned_m[:2])
             await _fly(job, pipe, stage, crew, job.sitl)
             await crew.land()
@@ -208,11 +211,10 @@ class Exposures:
 
 async def _report(stage: Stage, heard: Heard, pipe: Connection, began_ns: int) -> None:
     clock: Clock = stage.clock
-    goal = stage.world.goal_ned_m
     while True:
         now_ns = clock.now_ns()
         truth = stage.truth(now_ns)
-        distance_m = ((truth.p_ned_m[0] - goal[0]) ** 2 + (truth.p_ned_m[1] - goal[1]) ** 2) ** 0.5
+        distance_m = stage.world.to_goal_m(truth.p_ned_m)
         speed_m_s = (truth.v_ned_m_s[0] ** 2 + truth.v_ned_m_s[1] ** 2) ** 0.5
         seconds, state = (now_ns - began_ns) / S, str(heard.state)
         pipe.send(Progress(seconds, state, distance_m, speed_m_s, stage.baseline_m(now_ns)))

@@ -10,9 +10,9 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 
-from morpheyes_daemon.clock import Clock
-from morpheyes_daemon.devices.link import open_link
-from morpheyes_daemon.errors import ConfigError
+from morpheyes_daemon.clock import Clock, S
+from morpheyes_daemon.devices.link import Link, OnBytes, open_link
+from morpheyes_daemon.errors import ConfigError, DeviceNotFoundError
 from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED
 from morpheyes_daemon.simulation.mavsdk_crew import SITL_RC_PORT, MavsdkCrew, RadioOverUdp
 from morpheyes_daemon.simulation.radio import Radio
@@ -20,9 +20,12 @@ from morpheyes_daemon.simulation.sitl_vehicle import SitlVehicle
 
 FIRST_PORT, CREW_PORT, TRUTH_PORT = 5760, 2, 3
 """SITL's serial0 is tcp 5760 (plus 10 per instance); serial1 and serial2 are two and three above."""
+BOOT_LIMIT_NS = 20 * S
+
 RECOMMENDED_HERE = {name: value for name, value in RECOMMENDED.items() if name != "RNGFND1_TYPE"}
 RECOMMENDED_HERE[f"RC{Radio.SWITCH_CHANNEL}_OPTION"] = 0.0
 """The rangefinder is SITL's own; the engage switch must do nothing else."""
+
 
 @contextlib.asynccontextmanager
 async def open_sitl(url: str, clock: Clock) -> AsyncIterator[tuple[SitlVehicle, MavsdkCrew]]:
@@ -30,7 +33,7 @@ async def open_sitl(url: str, clock: Clock) -> AsyncIterator[tuple[SitlVehicle, 
     host, port = _address(url)
     radio = Radio()
     buffer: list[SitlVehicle] = []
-    link = await open_link(f"tcp:{host}:{port + TRUTH_PORT}", lambda data: buffer[0].on_bytes(data), lambda why: None)
+    link = await _booted(host, port, lambda data: buffer[0].on_bytes(data), clock)
     vehicle = SitlVehicle(link, radio, clock)
     buffer.append(vehicle)
     waves = RadioOverUdp(radio, clock, host, SITL_RC_PORT + port - FIRST_PORT)
@@ -45,6 +48,22 @@ async def open_sitl(url: str, clock: Clock) -> AsyncIterator[tuple[SitlVehicle, 
         sending.cancel()
         await asyncio.gather(sending, return_exceptions=True)
         link.close()
+
+
+async def _booted(host: str, port: int, on_bytes: OnBytes, clock: Clock) -> Link:
+    """Open the truth's port. SITL boots, and opens its other ports, only once somebody is on the first one."""
+    knock = await open_link(f"tcp:{host}:{port}", lambda data: None, lambda why: None)
+    end_ns = clock.now_ns() + BOOT_LIMIT_NS
+    try:
+        while True:
+            try:
+                return await open_link(f"tcp:{host}:{port + TRUTH_PORT}", on_bytes, lambda why: None)
+            except DeviceNotFoundError:
+                if clock.now_ns() > end_ns:
+                    raise
+                await clock.sleep_until_ns(clock.now_ns() + S // 2)
+    finally:
+        knock.close()
 
 
 def _address(url: str) -> tuple[str, int]:
