@@ -207,12 +207,29 @@ class Intent(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Line:
+    """A path to keep to between two commands: through `p_ned_m` at `t_ns`, a point that moves with `v_ned_m_s` and
+    `a_ned_m_s2`; the command's velocity goes along it, or, when it is zero, the point itself is held.
+
+    `gain_1_s` turns what is missing to the line into speed, at most `most_m_s` of it.
+    """
+
+    t_ns: int
+    p_ned_m: tuple[float, float, float]
+    v_ned_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    a_ned_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gain_1_s: float = 1.5
+    most_m_s: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
 class MissionCommand:
     """Velocity, heading and baseline that the mission wants; worthless after `expires_ns`.
 
     `clear_m` is how far the swept corridor along `v_ned_m_s` is known to be free, measured from where the vehicle
     was at `measured_ns`; the governor never lets the vehicle outrun it. `margin_m` has been taken off already.
-    `coast` asks for neutral pitch and roll (the last stretch through a gap). `detail` is for log and plots.
+    `coast` asks for neutral pitch and roll (the last stretch through a gap). `line` is kept to at every stick period,
+    in height too when `height_m` is None. `detail` is for log and plots, `text` says more about the reason.
     """
 
     seq: int
@@ -230,6 +247,8 @@ class MissionCommand:
     z_close_m: float = math.nan
     coast: bool = False
     detail: dict[str, float] = field(default_factory=dict)
+    line: Line | None = None
+    text: str = ""
 
 
 @dataclass(frozen=True, slots=True)

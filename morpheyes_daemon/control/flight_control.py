@@ -9,6 +9,7 @@ import math
 from dataclasses import replace
 
 from morpheyes_daemon.control.governor import Governor
+from morpheyes_daemon.control.line import wanted_velocity
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.velocity import VelocityController, VelocityTuning, height_above_ground_m
 from morpheyes_daemon.messages import DepthSummary, Governed, MissionCommand, Sticks, VehicleState
@@ -31,6 +32,8 @@ class FlightControl:
     ) -> tuple[Sticks, Governed]:
         """Return the sticks for a command and what the governor made of its speed."""
         height_m = height_above_ground_m(vehicle, now_ns)
+        if command.line is not None:
+            command = replace(command, v_ned_m_s=wanted_velocity(command, vehicle, now_ns))
         governed = self._governor.limit(command, summary, vehicle, self.model, height_m, now_ns)
         north, east, down = command.v_ned_m_s
         scale = min(1.0, governed.limit_m_s / governed.wanted_m_s) if governed.wanted_m_s > 0.0 else 0.0

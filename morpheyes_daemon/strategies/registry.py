@@ -16,6 +16,8 @@ from morpheyes_daemon.yaml_source import line_of, read_text, validate
 
 BUILT_IN = {
     "forest": "morpheyes_daemon.strategies.forest:Forest",
+    "imo": "morpheyes_daemon.strategies.imo.strategy:Imo",
+    "gap": "morpheyes_daemon.strategies.gap:Gap",
 }
 
 

@@ -1,0 +1,401 @@
+"""Gap flight: through an opening of unknown shape and place, standing or moving (paper, section V-B).
+
+Looks for the wall's openings, stands off before the one that fits best, sets image and height on its safest point,
+shrinks the baseline ahead of time, watches whether the vehicle really fits, and then flies through along the wall's
+normal at a set speed. Until it is committed it never flies faster than it can stop in before the wall; once an
+opening has been confirmed over several frames, what is free reaches through it as far as it is seen to. The last
+stretch, where the edges have left the view, is flown on the opening's track.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from pydantic import Field
+
+from morpheyes_daemon.clock import S
+from morpheyes_daemon.control.baseline import baseline_for
+from morpheyes_daemon.messages import Intent, Line, MissionCommand
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, StrategyParameters, View
+from morpheyes_daemon.strategies.gap_track import Motion, PointTrack
+from morpheyes_daemon.strategies.opening import Opening, Place, Silhouette, find_openings, passage
+from morpheyes_daemon.strategies.wall import split
+from morpheyes_daemon.transforms import Array, wrap_rad
+
+
+class GapParameters(StrategyParameters):
+    """What `parameters:` of a gap mission may say."""
+
+    speed_m_s: float = Field(3.0, gt=0.2, le=6, description="through the opening; the governor is the real bound")
+    approach_m_s: float = Field(1.2, gt=0.1, le=3, description="to the stand-off")
+    stand_off_m: float = Field(3.4, gt=1.5, le=10, description="from here it measures, and takes its run")
+    margin_m: float = Field(0.0, ge=0, le=0.5, description="measured room around the silhouette that it must have")
+    lean_deg: float = Field(12.0, ge=0, le=30, description="of the vehicle when crossing, for its silhouette")
+    baseline_gain: float = Field(0.05, gt=0, le=1, description="K of b = K median(Z_C)")
+    confirm_frames: int = Field(5, ge=2, le=50, description="frames in a row that must show that it fits")
+    off_line_m: float = Field(0.05, gt=0.005, le=0.5, description="how near to the line it must be to take its run")
+    look_s: float = Field(12.0, gt=1, le=120, description="without an opening for so long it refuses")
+    watch_s: float = Field(9.0, gt=2, le=60, description="a moving opening is watched for so long before the run")
+    behind_m: float = Field(0.6, gt=0.2, le=10, description="past the wall by this it stops")
+
+
+class Phase(StrEnum):
+    """What the decider is doing. APPROACH: to the stand-off, and measuring there. CLOSE: the eyes draw together."""
+
+    APPROACH = "approach"
+    CLOSE = "close"
+    RUN = "run"
+    BEHIND = "behind"
+    OVER = "over"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GapPercept:
+    """What one frame shows of wall and openings. `range_m` to the wall along its normal and the normal's heading
+    `yaw_rad` are NaN without a wall; `separation` is Ashman's D of the two depth clusters, `bimodal` whether there
+    are two. `scale_sigma` is the relative doubt of every length, from the baseline's. `origin_ned_m` is the camera.
+    """
+
+    t_ns: int
+    bimodal: bool
+    separation: float
+    range_m: float
+    yaw_rad: float
+    near_limit_m: float
+    scale_sigma: float
+    origin_ned_m: tuple[float, float, float]
+    silhouette: Silhouette
+    openings: tuple[Opening, ...]
+
+
+RANGE_SIGMA: Array = np.array([0.006, 0.006, 0.012])
+"""One sigma of where an opening is seen (ned), per metre of range: a pixel and the attitude, which pitches most."""
+
+YAW_SIGMA: Array = np.full(3, 0.02)
+"""One sigma of a wall's heading, radians."""
+
+SURE_SCALE = 0.02
+"""Lengths are taken from depth only when the baseline is known this well; while the eyes move they are not."""
+
+SAME_M = 0.5
+"""An opening seen this near to where the tracked one should be is the same."""
+
+LOST_S = 0.7
+"""Not seen for so long on the run, while there is room to stop: the run is broken off."""
+
+STAND_M = 0.35
+"""So near to the stand-off it may take its run."""
+
+TURNED_RAD = math.radians(3.0)
+SETTLED_M = 0.004
+
+HOLD_1_S, RUN_1_S = 0.6, 2.0
+"""Gains on what is missing to the line; gentle before the wall, since a vehicle that brakes looks up."""
+
+MOVES_M = 0.12
+"""A place that wanders by more within some seconds moves; the autopilot's drift is 0.05 m."""
+
+NOSE_M = 0.3
+"""From the autopilot to the foremost point, with some room."""
+
+
+class Gap(Strategy):
+    """See the module."""
+
+    Parameters = GapParameters
+    parameters: GapParameters
+
+    def __init__(self, parameters: GapParameters, craft: Craft) -> None:
+        super().__init__(parameters, craft)
+        self._phase = Phase.APPROACH
+        self._track = PointTrack()
+        self._yaw = PointTrack()
+        self._room: list[float] = []
+        self._chosen: Opening | None = None
+        self._beyond_m = 0.0
+        self._yaw_rad = 0.0
+        self._height_m = math.nan
+        self._settled_ns = 0
+        self._seen_ns = 0
+        self._seq = 0
+
+    # -- looking ------------------------------------------------------------------------------------------------
+
+    @property
+    def silhouette(self) -> Silhouette:
+        """The vehicle along its way, in crossing attitude at the smallest baseline."""
+        footprint, lean = self.craft.footprint, math.radians(self.parameters.lean_deg)
+        height_m = (footprint.hull_height_mm * math.cos(lean) + footprint.hull_length_mm * math.sin(lean)) / 1e3
+        return Silhouette(footprint.width_m(self.craft.baseline_range_m[0]), height_m)
+
+    def perceive(self, view: View) -> GapPercept:
+        """Return the openings of the wall ahead."""
+        silhouette = self.silhouette
+        found = split(view.depth)
+        way = passage(found.plane, view.depth.pinhole, view.T_ned_rect) if found else None
+        openings = find_openings(view.depth, found, way, silhouette) if found and way else ()
+        return GapPercept(
+            t_ns=view.depth.t_ns,
+            bimodal=found.bimodal if found else False,
+            separation=found.separation if found else 0.0,
+            range_m=way.range_m if way else math.nan,
+            yaw_rad=way.yaw_rad if way else math.nan,
+            near_limit_m=view.depth.near_limit_m,
+            scale_sigma=view.depth.baseline_sigma_m / view.depth.baseline_m,
+            origin_ned_m=_three(view.T_ned_rect[:3, 3]),
+            silhouette=silhouette,
+            openings=openings,
+        )
+
+    # -- deciding -----------------------------------------------------------------------------------------------
+
+    def decide(self, observation: Observation) -> MissionCommand:
+        """Return line, speed and baseline until the next frame."""
+        if not observation.engaged:
+            self._settle(observation)
+        self._take_in(observation.percept, observation)
+        match self._phase:
+            case Phase.APPROACH | Phase.CLOSE:
+                return self._approach(observation)
+            case Phase.RUN:
+                return self._run(observation)
+            case Phase.BEHIND:
+                return self._stop_behind(observation)
+            case Phase.OVER:
+                return self._command(observation, Intent.DONE, Reason.GOAL_REACHED)
+
+    def _settle(self, observation: Observation) -> None:
+        """Before the mission engages: forget what the climb showed."""
+        self._phase = Phase.APPROACH
+        self._track, self._yaw, self._room, self._chosen = PointTrack(), PointTrack(), [], None
+        self._yaw_rad = observation.vehicle.yaw_rad
+        self._settled_ns = self._seen_ns = observation.now_ns
+
+    def _take_in(self, percept: GapPercept, observation: Observation) -> None:
+        """Follow the chosen opening, or choose one: the roomiest."""
+        if self._phase in (Phase.BEHIND, Phase.OVER):
+            return
+        whole = [opening for opening in percept.openings if not opening.cut]
+        if not whole:
+            return
+        found = self._same(whole, percept.t_ns) if self._track.count else max(whole, key=_room)
+        if found is None:
+            return
+        opening, place = (found, found.places[0]) if isinstance(found, Opening) else found
+        self._chosen = opening
+        self._seen_ns = percept.t_ns
+        self._beyond_m = opening.beyond_m
+        p = self._scaled(np.array(place.p_ned_m), percept)
+        self._track.see(percept.t_ns, p, RANGE_SIGMA * max(0.5, opening.z_m))
+        if self._phase is not Phase.RUN or self._track.moves:
+            heading = np.array([0.0, wrap_rad(percept.yaw_rad - self._yaw_rad), 0.0])
+            self._yaw.see(percept.t_ns, heading, YAW_SIGMA)
+        measures = self._phase is Phase.APPROACH and opening.z_m < 1.2 * self.parameters.stand_off_m
+        if measures and percept.scale_sigma < SURE_SCALE:
+            self._room = [*self._room[-30:], place.clearance_m]
+        if self._track.spread_m(3.0) > MOVES_M:
+            self._track.moves = self._yaw.moves = True
+
+    def _scaled(self, p_ned_m: Array, percept: GapPercept) -> Array:
+        """Return where the opening was seen; with the eyes under way only the direction, at the range known before."""
+        if percept.scale_sigma < SURE_SCALE or not self._track.count:
+            return p_ned_m
+        ahead, origin = self._ahead(percept.t_ns), np.array(percept.origin_ned_m)
+        known = float((self._track.at(percept.t_ns).p_m - origin) @ ahead)
+        return np.asarray(origin + (p_ned_m - origin) * known / max(0.1, float((p_ned_m - origin) @ ahead)))
+
+    def _same(self, openings: list[Opening], t_ns: int) -> tuple[Opening, Place] | None:
+        """Return which of the openings, and which place in it, is the tracked one."""
+        at = self._track.at(t_ns).p_m
+        near = [
+            (float(np.linalg.norm((np.array(place.p_ned_m) - at)[1:])), opening, place)
+            for opening in openings
+            for place in self._candidates(opening)
+        ]
+        off_m, opening, place = min(near, key=lambda row: row[0])
+        return (opening, place) if off_m < SAME_M else None
+
+    def _candidates(self, opening: Opening) -> tuple[Place, ...]:
+        """The paper's x_s where it is as good as the roomiest place, and the roomiest places."""
+        best = opening.places[0].clearance_m
+        safest = (opening.safest,) if opening.safest.clearance_m > best - 0.005 else ()
+        return (*opening.places, *safest)
+
+    def _approach(self, observation: Observation) -> MissionCommand:
+        """Fly to the stand-off, set on the opening, confirm that the vehicle fits; then take the run or refuse."""
+        parameters, vehicle, now_ns = self.parameters, observation.vehicle, observation.now_ns
+        percept: GapPercept = observation.percept
+        if self._chosen is None or now_ns - self._seen_ns > 2 * S:
+            if observation.engaged and now_ns - max(self._settled_ns, self._seen_ns) > parameters.look_s * S:
+                why = "no opening in the wall" if percept.bimodal else "the depth has no two clusters"
+                return self._command(observation, Intent.REFUSE, Reason.MISSION_REFUSED, text=why)
+            return self._command(observation, Intent.STOP, Reason.NO_FREE_PATH)
+        opening, ahead = self._track.at(now_ns), self._ahead(now_ns)
+        range_m = float((opening.p_m - np.array(vehicle.p_ned_m)) @ ahead)
+        start = opening.p_m - parameters.stand_off_m * ahead
+        if observation.engaged and self._stands(observation, start, ahead):
+            if len(self._room) >= 2 * parameters.confirm_frames and not self._fits():
+                return self._refuse(observation)
+            if self._phase is Phase.APPROACH and len(self._room) >= 2 * parameters.confirm_frames:
+                self._phase = Phase.CLOSE
+            elif self._phase is Phase.CLOSE and self._closed(observation) and self._may_run(observation):
+                self._phase = Phase.RUN
+                return self._run(observation)
+        return self._hold(observation, opening, start, ahead, range_m)
+
+    def _hold(
+        self, observation: Observation, opening: Motion, start: Array, ahead: Array, range_m: float
+    ) -> MissionCommand:
+        """Go to the stand-off and follow the opening there."""
+        line = Line(
+            observation.now_ns, _three(start), _three(opening.v_m_s), _three(opening.a_m_s2), HOLD_1_S,
+            self.parameters.approach_m_s,
+        )  # fmt: skip
+        return self._command(
+            observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(observation.now_ns),
+            clear_m=max(0.0, range_m - NOSE_M), z_m=range_m,
+        )  # fmt: skip
+
+    def _stands(self, observation: Observation, start: Array, ahead: Array) -> bool:
+        """Tell whether it stands at the stand-off, set on the opening as it was seen a moment ago."""
+        vehicle = observation.vehicle
+        off = start - np.array(vehicle.p_ned_m)
+        along_m = float(off @ ahead)
+        across_m = float(np.linalg.norm(off - along_m * ahead))
+        turned = abs(wrap_rad(self._heading_rad(observation.now_ns) - vehicle.yaw_rad))
+        wide = 2.5 if self._track.moves else 1.0
+        return (
+            abs(along_m) < STAND_M
+            and across_m < wide * self.parameters.off_line_m
+            and turned < wide * TURNED_RAD
+            and observation.now_ns - self._seen_ns < LOST_S * S
+        )
+
+    def _closed(self, observation: Observation) -> bool:
+        """Tell whether the bar, modelled baseline and three sigmas of it, is no wider than it is to be."""
+        low_m, summary = self.craft.baseline_range_m[0], observation.summary
+        widest_m = summary.baseline_m + 3 * summary.baseline_sigma_m
+        fits = self.craft.footprint.width_m(widest_m) <= self.silhouette.width_m + 1e-3
+        return fits and abs(summary.baseline_m - low_m) < SETTLED_M
+
+    def _fits(self) -> bool:
+        """Tell whether the last frames show that the silhouette fits."""
+        recent = self._room[-2 * self.parameters.confirm_frames :]
+        return float(np.median(recent)) >= self.parameters.margin_m
+
+    def _may_run(self, observation: Observation) -> bool:
+        """A standing opening at once; a moving one after it was watched, when it will be slow at the crossing."""
+        if not self._track.moves:
+            return True
+        return observation.now_ns - self._settled_ns > self.parameters.watch_s * S
+
+    def _refuse(self, observation: Observation) -> MissionCommand:
+        need, chosen = self.silhouette, self._chosen
+        assert chosen is not None
+        room_m = float(np.median(self._room[-2 * self.parameters.confirm_frames :]))
+        text = (
+            f"the opening is {chosen.width_m:.2f} x {chosen.height_m:.2f} m with {room_m * 1e3:.0f} mm of room; "
+            f"the vehicle needs {need.width_m:.2f} x {need.height_m:.2f} m and {self.parameters.margin_m * 1e3:.0f} mm "
+            f"at a baseline of {self.craft.baseline_range_m[0] * 1e3:.0f} mm"
+        )
+        return self._command(observation, Intent.REFUSE, Reason.MISSION_REFUSED, text=text)
+
+    def _run(self, observation: Observation) -> MissionCommand:
+        """Through the opening; broken off while it can still stop before the wall and the opening is lost."""
+        parameters, vehicle, now_ns = self.parameters, observation.vehicle, observation.now_ns
+        opening, ahead = self._track.at(now_ns), self._ahead(now_ns)
+        range_m = float((opening.p_m - np.array(vehicle.p_ned_m)) @ ahead)
+        if range_m < -parameters.behind_m:
+            self._phase = Phase.BEHIND
+            return self._stop_behind(observation)
+        lost = now_ns - self._seen_ns > LOST_S * S
+        stoppable = range_m - NOSE_M > observation.reserve_m
+        if stoppable and (lost or not self._fits()):
+            self._phase = Phase.CLOSE
+            return self._approach(observation)
+        beyond_m = range_m + self._beyond_m
+        v = parameters.speed_m_s * ahead
+        line = Line(now_ns, _three(opening.p_m), _three(opening.v_m_s), _three(opening.a_m_s2), RUN_1_S, 1.0)
+        return self._command(
+            observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(now_ns), v_ned_m_s=_three(v),
+            clear_m=max(0.0, beyond_m - NOSE_M), z_m=beyond_m, contour_m=range_m,
+        )  # fmt: skip
+
+    def _stop_behind(self, observation: Observation) -> MissionCommand:
+        """Neutral sticks; over when it stands."""
+        if math.hypot(*observation.vehicle.v_ned_m_s) < 0.2:
+            self._phase = Phase.OVER
+            return self._command(observation, Intent.DONE, Reason.GOAL_REACHED)
+        return self._command(observation, Intent.STOP, None)
+
+    def _ahead(self, t_ns: int) -> Array:
+        yaw_rad = self._heading_rad(t_ns)
+        return np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
+
+    def _heading_rad(self, t_ns: int) -> float:
+        """Heading of the wall's normal."""
+        if not self._yaw.count:
+            return self._yaw_rad
+        return wrap_rad(self._yaw_rad + float(self._yaw.at(t_ns).p_m[1]))
+
+    def _command(
+        self,
+        observation: Observation,
+        intent: Intent,
+        reason: Reason | None,
+        *,
+        line: Line | None = None,
+        yaw_rad: float | None = None,
+        v_ned_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        clear_m: float = 0.0,
+        z_m: float = math.nan,
+        contour_m: float = math.nan,
+        text: str = "",
+    ) -> MissionCommand:
+        self._seq += 1
+        z_c_m = z_m if math.isnan(contour_m) else contour_m
+        low, high = self.craft.baseline_range_m
+        following = self._phase is Phase.APPROACH
+        baseline_m = baseline_for(z_c_m, self.parameters.baseline_gain, (low, high)) if following else low
+        return MissionCommand(
+            seq=self._seq,
+            t_ns=observation.now_ns,
+            expires_ns=observation.now_ns + round(3 * self.craft.frame_period_s * S),
+            intent=intent,
+            reason=reason,
+            v_ned_m_s=v_ned_m_s,
+            yaw_rad=yaw_rad,
+            height_m=None,
+            baseline_m=baseline_m,
+            clear_m=clear_m,
+            measured_ns=observation.vehicle.position_t_ns,
+            p_measured_ned_m=observation.vehicle.p_ned_m,
+            z_close_m=z_m,
+            detail=self._detail(z_c_m),
+            line=line,
+            text=text,
+        )
+
+    def _detail(self, z_c_m: float) -> dict[str, float]:
+        chosen = self._chosen
+        if chosen is None:
+            return {}
+        return {
+            "range_m": z_c_m,
+            "room_m": self._room[-1] if self._room else math.nan,
+            "opening_width_m": chosen.width_m,
+            "opening_height_m": chosen.height_m,
+            "beyond_m": self._beyond_m,
+        }
+
+
+def _room(opening: Opening) -> float:
+    return opening.places[0].clearance_m
+
+
+def _three(vector: Array) -> tuple[float, float, float]:
+    return float(vector[0]), float(vector[1]), float(vector[2])
