@@ -36,7 +36,7 @@ def command(
     from morpheyes_daemon.cli.progress import progress_line
 
     require_simulator()
-    from morpheyes_daemon.experiments.campaign import Campaign, cells, parse_seeds, run_campaign
+    from morpheyes_daemon.experiments.campaign import Campaign, parse_seeds, run_campaign
     from morpheyes_daemon.experiments.plan import make_plan
 
     with progress_line() as report:
@@ -61,10 +61,22 @@ def command(
             report(f"{plan.mission_name} flights", have, total)
 
         rows = run_campaign(campaign, folder, jobs, scheduler, done)
-    result = {"flights": rows, "cells": cells(rows)}
+    found, text = _tabled(plan.mission.strategy, rows)
+    result = {"flights": rows, "cells": found}
     (folder / "results.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    (folder / "table.md").write_text(table(result["cells"]) + "\n", encoding="utf-8")
-    typer.echo(json.dumps(result, indent=2) if as_json else f"{table(result['cells'])}\n\n{folder}/results.json")
+    (folder / "table.md").write_text(text + "\n", encoding="utf-8")
+    typer.echo(json.dumps(result, indent=2) if as_json else f"{text}\n\n{folder}/results.json")
+
+
+def _tabled(strategy: str, rows: list[Row]) -> tuple[list[Row], str]:
+    """Return the cells of a campaign and the table that its field reports them in."""
+    if strategy == "gap":
+        from morpheyes_daemon.experiments.gap_table import gap_cells, gap_table
+
+        return (found := gap_cells(rows)), gap_table(found)
+    from morpheyes_daemon.experiments.campaign import cells
+
+    return (found := cells(rows)), table(found)
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from morpheyes_daemon.errors import InputError, UsageError
-from morpheyes_daemon.experiments.flight import FlightPlan, fly
+from morpheyes_daemon.experiments.flight import FlightPlan, Watchers, fly
+from morpheyes_daemon.experiments.measures import measures_for
 from morpheyes_daemon.experiments.plan import hold, parse_baseline, with_seed
 
 Row = dict[str, Any]
@@ -100,7 +101,9 @@ def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
 
 def fly_one(plan: FlightPlan, key: str) -> Row:
     """Fly one plan and return its row; runs in a worker process."""
-    return {**fly(plan).as_json(), "campaign": key}
+    measures = measures_for(plan)
+    summary = fly(plan, Watchers(attach=[measures.attach] if measures else []))
+    return {**summary.as_json(), **(measures.row() if measures else {}), "campaign": key}
 
 
 def _cell(mode: str, rows: Sequence[Row], variable: dict[int, Row]) -> Row:

@@ -94,12 +94,15 @@ class Stage:
         """Where the vehicle really was."""
         return self.vehicle.truth_at(t_ns)
 
+    def world_s(self, t_ns: int) -> float:
+        """Time of the world, by which things in it move."""
+        return (t_ns - self._epoch_ns) / S
+
     def clearance_m(self, t_ns: int) -> float:
         """Distance from hull and bar to the nearest obstacle, ground aside; negative is a collision."""
         truth = self.truth(t_ns)
         T = truth.T_ned_frd
-        t_s = (t_ns - self._epoch_ns) / S
-        return self.world.clearance_m(T[:3, 3], T[:3, :3], self._shape, self.baseline_m(t_ns), t_s)
+        return self.world.clearance_m(T[:3, 3], T[:3, :3], self._shape, self.baseline_m(t_ns), self.world_s(t_ns))
 
     def expose(self, seq: int, t_ns: int) -> RawPair:
         """Take a stereo pair at `t_ns`, which must lie a sync offset in the past."""

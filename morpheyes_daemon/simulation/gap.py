@@ -22,10 +22,17 @@ BELOW_GROUND_M = 1.2
 """How far the wall goes on below the ground, so that it may sway downwards and upwards."""
 
 
-class Opening(Section):
-    """One opening; what is left out is drawn by the seed."""
+BLOBS = 20
+"""Different blobs among the shapes that `any` draws from."""
 
-    shape: Shape = "rectangle"
+
+class Opening(Section):
+    """One opening; what is left out is drawn by the seed.
+
+    `any` takes the three named shapes and 20 blobs in turn, so that 23 seeds in a row see every one of them.
+    """
+
+    shape: Shape | Literal["any"] = "rectangle"
     slack: float = Field(1.0, ge=0.3, le=5, description="1: what the vehicle needs just fits in")
     across_m: float | None = Field(None, ge=-3, le=3, description="to the right of the course line")
     height_m: float | None = Field(None, ge=0.8, le=2.4)
@@ -51,10 +58,18 @@ class GapWorld(Section):
     meadow: bool = Field(True, description="grass and sky around; off where another world has them")
 
 
+def drawn_shape(shape: Shape | Literal["any"], seed: int) -> Shape:
+    """Return the shape that an opening has in the world of a seed."""
+    if shape != "any":
+        return shape
+    named: tuple[Shape, ...] = ("rectangle", "infinity", "goku")
+    return named[seed % (BLOBS + 3)] if seed % (BLOBS + 3) < 3 else "blob"
+
+
 def gap_contents(world: GapWorld, seed: int, light: Light) -> Contents:
     """Return wall, mural and ground."""
     rng = np.random.default_rng([seed, 500])
-    outlines, middle = _place(world, rng)
+    outlines, middle = _place(world, rng, seed)
     wall = Wall(
         np.array([-world.half_width_m, -world.top_m]), np.array([world.half_width_m, BELOW_GROUND_M]), outlines,
         world.thickness_mm / 1e3,
@@ -74,13 +89,17 @@ def gap_contents(world: GapWorld, seed: int, light: Light) -> Contents:
     return standing + meadow() if world.meadow else standing
 
 
-def _place(world: GapWorld, rng: np.random.Generator) -> tuple[tuple[Array, ...], float]:
+def _place(world: GapWorld, rng: np.random.Generator, seed: int) -> tuple[tuple[Array, ...], float]:
     """Return the outlines in the wall's frame and where its origin is across the course.
 
     Several openings without a place of their own are spread over the wall, so that they cannot touch.
     """
     width, height = world.fit_width_mm / 1e3, world.fit_height_mm / 1e3
-    shapes = [outline(o.shape, rng, width, height, o.slack) for o in world.openings]
+    blob = np.random.default_rng([seed % (BLOBS + 3), 501])
+    shapes = [
+        outline(drawn_shape(o.shape, seed), blob if o.shape == "any" else rng, width, height, o.slack)
+        for o in world.openings
+    ]
     widths = np.array([np.ptp(shape[:, 0]) for shape in shapes])
     lanes = np.cumsum(widths + 0.4) - 0.5 * (widths + 0.4)
     lanes -= lanes.mean() - rng.uniform(-0.6, 0.6)

@@ -1,0 +1,121 @@
+"""What a gap flight is measured by, beside what every flight is: how it went through, and how well it saw the opening.
+
+Looks on at a simulated flight with the simulator's truth; the daemon hears nothing of it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from morpheyes_daemon.app import Daemon
+from morpheyes_daemon.experiments.flight import FlightPlan
+from morpheyes_daemon.experiments.gap_truth import filled, iou, true_masks
+from morpheyes_daemon.experiments.stage import Stage
+from morpheyes_daemon.messages import Intent, MissionCommand, Perception, StereoFrame
+from morpheyes_daemon.safety.gate import GateOutput
+from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.simulation.gap import GapWorld, drawn_shape
+from morpheyes_daemon.simulation.worlds import load_world
+from morpheyes_daemon.stereo.rectify import Rectifier
+from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.strategies.gap import GapPercept
+from morpheyes_daemon.transforms import Array, inverse
+
+BESIDE_M = 0.6
+"""The vehicle's centre this near to the wall's plane: it is in the opening."""
+
+FRAMES_KEPT = 16
+
+
+class GapMeasures:
+    """Attach to a flight's watchers; `row` afterwards."""
+
+    def __init__(self, plan: FlightPlan) -> None:
+        size = (plan.config.camera.width_px, plan.config.camera.height_px)
+        self._rectifier = Rectifier(RigModel.load(plan.calibration), size)
+        self._plan = plan
+        self._frames: dict[int, StereoFrame] = {}
+        self._ious: list[float] = []
+        self._clearance_m = math.inf
+        self._crossing_m_s = math.nan
+        self._before_m = math.nan
+        self._text = ""
+
+    def attach(self, daemon: Daemon, stage: Stage) -> None:
+        """Look on at this flight."""
+        daemon.topics.frame.tap(self._keep)
+        daemon.topics.perception.tap(lambda seen: self._compare(seen, daemon, stage))
+        daemon.topics.gate.tap(lambda out: self._watch(out, stage))
+        daemon.topics.command.tap(self._hear)
+
+    def row(self) -> dict[str, Any]:
+        """Return the columns of a gap flight."""
+        shape, motion = _world_of(self._plan)
+        return {
+            "clearance_m": _rounded(self._clearance_m),
+            "crossing_speed_m_s": _rounded(self._crossing_m_s),
+            "contour_iou": _rounded(float(np.median(self._ious)) if self._ious else math.nan),
+            "shape": shape,
+            "motion": motion,
+            "text": self._text,
+        }
+
+    def _keep(self, frame: StereoFrame) -> None:
+        self._frames[frame.seq] = frame
+        while len(self._frames) > FRAMES_KEPT:
+            del self._frames[next(iter(self._frames))]
+
+    def _compare(self, seen: Perception, daemon: Daemon, stage: Stage) -> None:
+        """Hold every opening seen whole against the true one that it covers best, until the wall is behind."""
+        frame = self._frames.get(seen.summary.seq)
+        if daemon.guardian.state is not State.ENGAGED or frame is None or not isinstance(seen.percept, GapPercept):
+            return
+        openings = [opening for opening in seen.percept.openings if not opening.cut]
+        gap, t_ns = stage.world.gaps[0], frame.t_ns
+        T_ned_wall = gap.T_ned_wall(stage.world_s(t_ns))
+        T_ned_frd = stage.truth(t_ns).T_ned_frd
+        if not openings or _past_wall_m(T_ned_wall, T_ned_frd) > 0.0:
+            return
+        rectified = self._rectifier.at(frame.baseline.baseline_m)
+        T_ned_cam0 = stage.camera.T_ned_eye(0, T_ned_frd, stage.baseline_m(t_ns))
+        masks = true_masks(gap, T_ned_wall, T_ned_cam0, rectified)
+        for opening in openings:
+            contour = filled(opening.contour_px, rectified.pinhole)
+            self._ious.append(max(iou(contour, mask) for mask in masks))
+
+    def _watch(self, out: GateOutput, stage: Stage) -> None:
+        gap = stage.world.gaps[0]
+        truth = stage.truth(out.t_ns)
+        past_m = _past_wall_m(gap.T_ned_wall(stage.world_s(out.t_ns)), truth.T_ned_frd)
+        if self._before_m < 0.0 <= past_m:
+            self._crossing_m_s = math.hypot(*truth.v_ned_m_s)
+        self._before_m = past_m
+        if abs(past_m) < BESIDE_M:
+            self._clearance_m = min(self._clearance_m, stage.clearance_m(out.t_ns))
+
+    def _hear(self, command: MissionCommand) -> None:
+        if command.intent is Intent.REFUSE:
+            self._text = self._text or command.text
+
+
+def _past_wall_m(T_ned_wall: Array, T_ned_frd: Array) -> float:
+    """Return how far the vehicle's centre is behind the wall's middle plane."""
+    return float((inverse(T_ned_wall) @ T_ned_frd)[0, 3])
+
+
+def _world_of(plan: FlightPlan) -> tuple[str, str]:
+    """Return the shapes and the motion of the wall that the plan flies at."""
+    world = load_world(plan.scenario.world).world
+    if not isinstance(world, GapWorld):
+        return "", ""
+    shapes = [drawn_shape(opening.shape, plan.scenario.seed) for opening in world.openings]
+    return "+".join(shapes), world.motion.kind
+
+
+def _rounded(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None
+
+

@@ -1,0 +1,36 @@
+"""What is measured of a campaign's flights beside the summary, by the strategy that flies them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, Protocol
+
+from morpheyes_daemon.app import Daemon
+from morpheyes_daemon.experiments.flight import FlightPlan
+from morpheyes_daemon.experiments.stage import Stage
+
+MEASURES = {
+    "gap": "morpheyes_daemon.experiments.gap_measures:GapMeasures",
+}
+"""Strategy to the class that looks on."""
+
+
+class Measures(Protocol):
+    """Looks on at one flight."""
+
+    def attach(self, daemon: Daemon, stage: Stage) -> None:
+        """Tap what is needed."""
+
+    def row(self) -> dict[str, Any]:
+        """Return the further columns of the flight, once it is over."""
+
+
+def measures_for(plan: FlightPlan) -> Measures | None:
+    """Return what looks on at flights of a plan's strategy, None when the summary says it all."""
+    place = MEASURES.get(plan.mission.strategy)
+    if place is None:
+        return None
+    module, _, name = place.partition(":")
+    make: Callable[[FlightPlan], Measures] = getattr(import_module(module), name)
+    return make(plan)
