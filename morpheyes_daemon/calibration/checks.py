@@ -19,11 +19,13 @@ from morpheyes_daemon.calibration.yaw_watch import STILL, Look, YawWatch
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages import BaselineEstimate, Image, StereoFrame
-from morpheyes_daemon.stereo.depth import DepthEstimator
+from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
 from morpheyes_daemon.stereo.epipolar import RowFit, RowWatch, row_offsets
 from morpheyes_daemon.stereo.rig import RigModel
 
 _FEWEST_POINTS = 60
+_SERVO_SIGMA_M = 1e-4
+"""How well a servo at rest stands where it should."""
 
 
 @dataclass(frozen=True)
@@ -108,18 +110,19 @@ class RigCheck:
         """Look at one raw pair; raises InputError or CalibrationError when it does not fit the calibration."""
         here = self._checks.setdefault(nominal_m, BaselineCheck(nominal_m))
         here.pairs += 1
-        frame = StereoFrame(0, self._time_ns, left, right, BaselineEstimate(0, nominal_m, nominal_m, 0.0, False))
+        frame = StereoFrame(0, self._time_ns, left, right, BaselineEstimate(0, nominal_m, nominal_m, _SERVO_SIGMA_M, False))
         pair = self._estimator.rectified(frame)
         depth = self._estimator.depth(frame, pair)
-        disparity = np.float32(depth.baseline_m * depth.pinhole.f_px) / depth.depth_m
+        disparity = disparity_of(depth)
         offsets = row_offsets(pair.left, pair.right, disparity)
         if offsets.count < _FEWEST_POINTS:
             here.blind += 1
             return here
         here.rows_px.append(offsets.median_px)
-        here.fit = here.watch.add(offsets, depth.pinhole, np.zeros(offsets.count))
+        here.fit = here.watch.add(offsets, depth.pinhole)
         still = EyeMotion.still(depth.T_rig_rect)
-        self._yaw.add(Look(self._time_ns, pair.left, pair.right, disparity, depth.baseline_m, depth.pinhole, still))
+        seen = (disparity, depth.baseline_m, depth.baseline_sigma_m, depth.pinhole, still)
+        self._yaw.add(Look(self._time_ns, pair.left, pair.right, *seen))
         self._time_ns += S // 100
         return here
 

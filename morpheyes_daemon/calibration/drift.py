@@ -15,10 +15,11 @@ from enum import StrEnum
 
 import numpy as np
 
-from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates
+from morpheyes_daemon.calibration.ego_motion import EyeMotion, row_rates
 from morpheyes_daemon.calibration.yaw_watch import Look, Uncertain, YawWatch
-from morpheyes_daemon.messages import DepthMap, Image
-from morpheyes_daemon.stereo.epipolar import RowFit, RowWatch, row_offsets
+from morpheyes_daemon.messages import DepthMap
+from morpheyes_daemon.stereo.depth import RectifiedPair, disparity_of
+from morpheyes_daemon.stereo.epipolar import RowFit, RowOffsets, RowWatch
 from morpheyes_daemon.stereo.rectify import rectifying_rotation
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
@@ -41,7 +42,9 @@ class DriftLimits:
     """One sigma of the disparity bias from which half of `strong_sigmas` will do."""
     strong_sigmas: float = 6.0
     frames: int = 3
-    """Frames in a row that must agree."""
+    """Frames in a row that must agree ..."""
+    unsharp_frames: int = 10
+    """... and so many before a correction while the lateness is not measured: a manoeuvre then looks like a turn."""
     points: int = 80
     """Points that a frame must have to count at all."""
     largest_rad: float = math.radians(0.6)
@@ -50,12 +53,15 @@ class DriftLimits:
     """Time offset between the eyes that was declared."""
     late_change_s: float = 1e-3
     """How far the measured offset may be from it."""
+    baseline_share: float = 0.05
+    """A frame whose baseline is not known to this share tells nothing of the yaw."""
 
 
 class Drift(StrEnum):
     """What a finding is about."""
 
     ROWS = "rows"
+    UNEXPLAINED = "unexplained"
     TURNED = "turned"
     YAW = "yaw"
     LATE = "late"
@@ -108,27 +114,28 @@ class DriftMonitor:
         self._told: set[Drift] = set()
         self._fit: RowFit | None = None
         self._agreeing = 0
-        self._rows, self._yaw = RowWatch(memory=_MEMORY), YawWatch(uncertain)
+        self._rows, self._yaw = RowWatch(_MEMORY, self.limits.late_s), YawWatch(uncertain)
 
     def update(
-        self, left: Image, right: Image, depth: DepthMap, nominal_m: float, moving: bool, motion: EyeMotion
+        self, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, moving: bool, motion: EyeMotion
     ) -> DriftReport:
-        """Look at one rectified grey pair (H, W), its depth map, the nominal baseline and the eye's motion.
+        """Look at one pair rectified by `rig`, its depth map and row offsets, and the eye's motion.
 
-        `left` and `right` must be rectified by `rig`. Frames with the servo moving are only reported on.
+        A frame with the servo moving tells nothing of the rows, and of the yaw what its baseline's sigma lets it.
         """
-        disparity = np.float32(depth.baseline_m * depth.pinhole.f_px) / depth.depth_m
-        offsets = row_offsets(left, right, disparity)
-        if moving or offsets.count < self.limits.points:
+        if offsets.count < self.limits.points:
             self._agreeing = 0
             return self._report(offsets.median_px, offsets.count, self._fit, ())
-        rates = right_eye_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, motion)
-        self._fit = self._rows.add(offsets, depth.pinhole, rates[:, 1])
-        f_px = depth.pinhole.f_px
-        findings = self._judge_rows(offsets.median_px, f_px, nominal_m)
-        if not findings and offsets.median_px < 2 * self.limits.rows_px:
-            seen = (disparity, depth.baseline_m, depth.pinhole, motion)
-            self._yaw.add(Look(depth.t_ns, left, right, *seen, *self._late))
+        f_px, nominal_m = depth.pinhole.f_px, pair.rectification.nominal_m
+        findings = []
+        if not moving:
+            rates = row_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, motion)
+            self._fit = self._rows.add(offsets, depth.pinhole, *rates)
+            findings += self._judge_rows(offsets.median_px, f_px, nominal_m)
+        known = depth.baseline_sigma_m < self.limits.baseline_share * depth.baseline_m
+        if known and not findings and offsets.median_px < 2 * self.limits.rows_px:
+            seen = (disparity_of(depth), depth.baseline_m, depth.baseline_sigma_m, depth.pinhole, motion)
+            self._yaw.add(Look(depth.t_ns, pair.left, pair.right, *seen, *self._late))
             findings += self._judge_yaw(f_px, nominal_m)
         findings += self._judge_late()
         report = self._report(offsets.median_px, offsets.count, self._fit, tuple(findings))
@@ -146,7 +153,8 @@ class DriftMonitor:
 
     def _forget(self) -> None:
         """Start collecting anew, since what was collected belongs to another rectification."""
-        self._rows, self._yaw = RowWatch(memory=_MEMORY), YawWatch(self._uncertain)
+        self._rows.forget_turn()
+        self._yaw = YawWatch(self._uncertain)
         self._fit = None
         self._agreeing = 0
 
@@ -161,8 +169,8 @@ class DriftMonitor:
             self._agreeing = 0
             return self._unexplained(fit, median_px)
         self._agreeing += 1
-        if self._agreeing < limits.frames:
-            return []
+        if self._agreeing < (limits.frames if self._rows.sharp else limits.unsharp_frames):
+            return self._once(Drift.ROWS, f"rows differ by {median_px:.2f} px: watching whether an eye has turned")
         turn = np.array([fit.pitch_rad if sure[0] else 0.0, 0.0, fit.roll_rad if sure[1] else 0.0])
         text = f"the right eye has turned by {math.degrees(turn[0]):+.3f} deg in pitch and "
         return [self._turn(Drift.TURNED, turn, nominal_m, f"{text}{math.degrees(turn[2]):+.3f} deg in roll")]
@@ -171,7 +179,7 @@ class DriftMonitor:
         """Rows that differ though no turn and no time offset explains it."""
         if fit.residual_px < 2 * self.limits.rows_px or fit.count < 5 * self.limits.points:
             return []
-        return self._once(Drift.ROWS, f"rows differ by {median_px:.2f} px and no turn of an eye explains it")
+        return self._once(Drift.UNEXPLAINED, f"rows differ by {median_px:.2f} px and no turn of an eye explains it")
 
     def _judge_yaw(self, f_px: float, nominal_m: float) -> list[DriftFinding]:
         yaw, sigma, limits = self._yaw.yaw_rad, self._yaw.sigma_rad, self.limits
@@ -186,7 +194,8 @@ class DriftMonitor:
         fit, limits = self._fit, self.limits
         if fit is None or fit.late_sigma_s > 0.25 * limits.late_change_s or self._agreeing:
             return []
-        if abs(fit.late_s - limits.late_s) < limits.late_change_s:
+        off_s = abs(abs(fit.late_s) - limits.late_s)
+        if off_s < limits.late_change_s + 3.0 * fit.late_sigma_s:
             return []
         text = f"the right eye exposes {fit.late_s * 1e3:.1f} ms late, not {limits.late_s * 1e3:.1f} ms as declared"
         return self._once(Drift.LATE, text)

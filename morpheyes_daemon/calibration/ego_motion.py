@@ -35,6 +35,13 @@ def eye_motion(vehicle: VehicleState, T_frd_rig: Array, T_rig_rect: Array) -> Ey
     return EyeMotion(T_ned_rect, R_rect_frd @ v_frd, R_rect_frd @ w_frd)
 
 
+def row_rates(uv: Array, d_px: Array, pinhole: Pinhole, baseline_m: float, motion: EyeMotion) -> tuple[Array, Array]:
+    """Return how fast (n,) px/s the rows of static points move in the right eye: by its travel, and by its turning."""
+    travel = EyeMotion(motion.T_ned_rect, motion.v_rect_m_s, np.zeros(3))
+    by_travel = right_eye_rates(uv, d_px, pinhole, baseline_m, travel)[:, 1]
+    return by_travel, right_eye_rates(uv, d_px, pinhole, baseline_m, motion)[:, 1] - by_travel
+
+
 def right_eye_rates(uv: Array, d_px: Array, pinhole: Pinhole, baseline_m: float, motion: EyeMotion) -> Array:
     """Return how fast (n, 2) static points move in the right rectified image, px/s; uv (n, 2) are left pixels.
 

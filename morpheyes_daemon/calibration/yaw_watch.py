@@ -37,18 +37,19 @@ _TURN_RATE_SIGMA_RAD_S, _SPEED_SIGMA_M_S = 0.01, 0.05
 """How well the autopilot knows the vehicle's motion; with late eyes its error is one of all disparities."""
 _REMEMBERED = 20
 _WORTHWHILE = 1.1
-"""A pair is only worth working out when it tells this much more than the best one."""
+"""A pair is only worth working out when it promises to tell this much more than those before it."""
+_RATIO_BLUR = 0.01
+"""Doubt in the ratio of two baselines that blurs disparities about as much as the matcher does."""
 _SYSTEMATIC_PX = 0.04
 """What one pair of frames cannot average away: light, blur and perspective act on all points alike."""
 
 
 @dataclass(frozen=True, slots=True)
 class Uncertain:
-    """How far one sigma of the prediction goes: the eye's translation, its turn, each baseline's length."""
+    """How far one sigma of the prediction goes: the eye's translation and its turn."""
 
     translation_m: float = 0.10
     turn_rad: float = 0.01
-    length_m: float = 2e-4
 
 
 STILL = Uncertain(translation_m=1e-3, turn_rad=1e-3)
@@ -57,7 +58,7 @@ STILL = Uncertain(translation_m=1e-3, turn_rad=1e-3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """One rectified grey pair (H, W) with its disparity (H, W; NaN unknown), true baseline and the eye's motion.
+    """One rectified grey pair (H, W) with its disparity (H, W; NaN unknown), true baseline, sigma and the eye's motion.
 
     `late_s` is by how much the right eye exposes after the left one.
     """
@@ -67,6 +68,7 @@ class Look:
     right: Image
     disparity_px: FloatMap
     baseline_m: float
+    baseline_sigma_m: float
     pinhole: Pinhole
     motion: EyeMotion
     late_s: float = 0.0
@@ -100,7 +102,7 @@ class YawWatch:
         self._looks: deque[Look] = deque()
         self._done: list[YawFit] = []
         self._best: YawFit | None = None
-        self._best_leverage = 0.0
+        self._best_promise = 0.0
         self._since_ns = 0
         self.moving = 0
 
@@ -124,22 +126,24 @@ class YawWatch:
         return len(self._fits)
 
     def add(self, look: Look) -> YawFit | None:
-        """Take a frame with the servo at rest; returns what it told with an earlier one, None for nothing."""
+        """Take a frame; returns what it told with an earlier one, None for nothing."""
         self._close_epoch(look.t_ns)
         while self._looks and look.t_ns - self._looks[0].t_ns > OLDEST_S * 1e9:
             self._looks.popleft()
-        first = max(self._looks, key=lambda one: leverage(one.baseline_m, look.baseline_m), default=None)
+        first = max(self._looks, key=lambda one: promise(one, look), default=None)
         self._looks.append(look)
         if first is None or abs(first.baseline_m - look.baseline_m) < LEAST_CHANGE_M:
             return None
-        reach = leverage(first.baseline_m, look.baseline_m)
-        if reach < _WORTHWHILE * self._best_leverage:
+        if promise(first, look) < _WORTHWHILE * self._best_promise:
             return None
         fit = fit_yaw(first, look, self._uncertain)
-        if fit is not None and not fit.static:
+        if fit is None:
+            return None
+        self._best_promise = promise(first, look)
+        if not fit.static:
             self.moving += 1
-        elif fit is not None and (self._best is None or fit.sigma_rad < self._best.sigma_rad):
-            self._best, self._best_leverage = fit, reach
+        elif self._best is None or fit.sigma_rad < self._best.sigma_rad:
+            self._best = fit
         return fit
 
     @property
@@ -154,13 +158,23 @@ class YawWatch:
             if self._best is not None:
                 self._done = self._fits[-_REMEMBERED:]
                 self._looks.clear()
-            self._best, self._best_leverage, self._since_ns = None, 0.0, t_ns
+            self._best, self._best_promise, self._since_ns = None, 0.0, t_ns
 
 
 def leverage(baseline_1_m: float, baseline_2_m: float) -> float:
     """Return how much a yaw moves the difference of two disparities, over the noise of that difference."""
     ratio = baseline_2_m / baseline_1_m
     return abs(1.0 - ratio) / math.hypot(1.0, ratio)
+
+
+def promise(first: Look, second: Look) -> float:
+    """Return how much two looks can tell: their leverage, less where the baselines are in doubt."""
+    return leverage(first.baseline_m, second.baseline_m) / math.hypot(1.0, ratio_sigma(first, second) / _RATIO_BLUR)
+
+
+def ratio_sigma(first: Look, second: Look) -> float:
+    """Return one sigma, relative, of the ratio of the baselines of two looks."""
+    return math.hypot(*(look.baseline_sigma_m / look.baseline_m for look in (first, second)))
 
 
 def fit_yaw(first: Look, second: Look, uncertain: Uncertain) -> YawFit | None:
@@ -253,8 +267,7 @@ def _solve(
             -predicted * x[:, 1],
         ]
     )
-    ratio_sigma = uncertain.length_m * math.hypot(1.0 / first.baseline_m, 1.0 / second.baseline_m)
-    prior = np.array([math.inf, ratio_sigma, uncertain.translation_m, uncertain.turn_rad, uncertain.turn_rad])
+    prior = np.array([math.inf, ratio_sigma(first, second), uncertain.translation_m, uncertain.turn_rad, uncertain.turn_rad])
     noise = _NOISE_PX * np.sqrt(1.0 + slope**2)
     error = d_2 - predicted
     solution, covariance, kept = _robust(columns / noise[:, None], error / noise, 1.0 / prior)

@@ -131,6 +131,11 @@ def depth_from_disparity(disparity_px: FloatMap, baseline_m: float, f_px: float,
         return np.where(total > 0, np.float32(baseline_m * f_px) / total, np.float32(np.nan))
 
 
+def disparity_of(depth: DepthMap) -> FloatMap:
+    """Return the disparity (H, W) float32 pixels that a depth map came from, NaN where it is unknown."""
+    return np.asarray(np.float32(depth.baseline_m * depth.pinhole.f_px) / depth.depth_m, np.float32)
+
+
 def near_limit_m(baseline_m: float, f_px: float, ceiling_px: float, doffs_px: float = 0.0) -> float:
     """Return Z_min = b f / numDisparities, nearer than which nothing has a depth (paper-notes 11)."""
     return baseline_m * f_px / (ceiling_px + doffs_px)

@@ -3,6 +3,10 @@
 In a rectified pair of a rigid, synchronous rig a point has the same row in both eyes. Row offsets of a few hundred
 well-textured points tell a right eye that has turned (pitch lifts all rows, roll tilts them) from one that exposes
 late (rows then follow the motion). Yaw between the eyes leaves no trace here (paper-notes 14).
+
+Lateness is told from the rig's travel alone: how fast it moves a point's row depends on the point's depth, which no
+turn imitates, and the autopilot knows the travel well. How the rig turned in those milliseconds it knows badly, since
+vibration is faster than its messages; so each frame has a turn of its own, and only what stays is the eye's.
 """
 
 from __future__ import annotations
@@ -32,6 +36,15 @@ RETURN_PX = 0.3
 
 MIN_POINTS = 12
 """Fewer points than this explain nothing."""
+
+CORRELATED = 4.0
+"""Points err together, by light and texture: in flights the scatter over frames is 3 to 6 times what the points say."""
+
+TURN_RATE_SIGMA_RAD_S = 0.2
+"""How badly the turn rate during the time between the eyes is known."""
+
+SHARP_S = 5e-4
+"""One sigma from which a measured lateness is better than the expected one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,81 +144,118 @@ def _textured_points(left: Image, disparity_px: FloatMap) -> NDArray[np.intp]:
     return np.stack([margin + column * width + place % width, margin + row * height + place // width], axis=1)
 
 
-def row_rates(
-    offsets: RowOffsets, pinhole: Pinhole, baseline_m: float, v_rect_m_s: Array, w_rect_rad_s: Array
-) -> Array:
-    """Return how fast (n,) the rows of static points move, px/s: the rig moves with v (3,) and turns with w (3,).
-
-    dP/dt = -v - w x P, with P = (x, y, 1) b f / d.
-    """
-    x = (offsets.uv[:, 0] - pinhole.cx_px) / pinhole.f_px
-    y = (offsets.uv[:, 1] - pinhole.cy_px) / pinhole.f_px
-    per_m = np.maximum(offsets.d_px, 0.0) / (baseline_m * pinhole.f_px)
-    vx_vy_vz, (wx, wy, wz) = v_rect_m_s, w_rect_rad_s
-    turning = wx * (1.0 + y * y) - wy * x * y - wz * x
-    return np.asarray(pinhole.f_px * (turning + (y * vx_vy_vz[2] - vx_vy_vz[1]) * per_m))
-
-
 @dataclass(slots=True)
 class RowWatch:
     """Collects row offsets over frames and explains them; older frames fade by `memory` per frame.
 
-    Three unknowns: lateness, pitch and roll of the right eye. In each frame, points that its own explanation leaves
-    far out are left out.
+    In each frame, points that its own explanation leaves far out are left out. `expected_late_s` is reckoned with
+    until the lateness is measured; what was made of the rows by then is forgotten.
     """
 
     memory: float = 0.9
-    _normal: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    _moment: Array = field(default_factory=lambda: np.zeros(3))
+    expected_late_s: float = 0.0
+    sharp: bool = False
+    _reckoned_s: tuple[float, float] | None = None
+    _late_moment: float = 0.0
+    _late_information: float = 0.0
+    _turn_moment: Array = field(default_factory=lambda: np.zeros(2))
+    _turn_information: Array = field(default_factory=lambda: np.zeros((2, 2)))
     _square: float = 0.0
     _count: float = 0.0
 
-    def add(self, offsets: RowOffsets, pinhole: Pinhole, rates_px_s: Array) -> RowFit:
-        """Take one frame's offsets with the rows' rates (see `row_rates`) and return the present explanation."""
-        x = (offsets.uv[:, 0] - pinhole.cx_px) / pinhole.f_px
-        y = (offsets.uv[:, 1] - pinhole.cy_px) / pinhole.f_px
-        causes = np.stack([rates_px_s, pinhole.f_px * (1.0 + y * y), -pinhole.f_px * x], axis=1)
-        kept = _consistent(causes, offsets.dv_px)
-        causes, dv = causes[kept], offsets.dv_px[kept]
-        self._normal = self.memory * self._normal + causes.T @ causes
-        self._moment = self.memory * self._moment + causes.T @ dv
-        self._square = self.memory * self._square + float(dv @ dv)
-        self._count = self.memory * self._count + len(dv)
+    def add(
+        self, offsets: RowOffsets, pinhole: Pinhole, travel_px_s: Array | None = None, turn_px_s: Array | None = None
+    ) -> RowFit:
+        """Take one frame's offsets and return the present explanation.
+
+        `travel_px_s` and `turn_px_s` (n,) are how fast the rows of the points move in the right eye since the rig
+        travels and turns; None for a rig that stands still.
+        """
+        self._fade()
+        travel, turning = (np.zeros(offsets.count) if rate is None else rate for rate in (travel_px_s, turn_px_s))
+        columns = np.column_stack([travel, _turn_columns(offsets, pinhole)])
+        kept = _consistent(columns, offsets.dv_px)
+        if kept.any():
+            columns, dv = columns[kept], offsets.dv_px[kept]
+            left_over = dv - columns @ _least_squares(columns, dv)
+            noise_px = CORRELATED * max(float(left_over.std()), 0.02)
+            self._square += float(left_over @ left_over)
+            self._count += len(dv)
+            self._add_late(columns[:, 0], columns[:, 1:], dv, noise_px)
+            late_s, doubt_s = self._reckon()
+            rest = dv - late_s * (columns[:, 0] + turning[kept])
+            self._add_turn(columns[:, [1, 3]], rest, noise_px, math.hypot(late_s, doubt_s))
         return self._fit()
 
-    def _solution(self) -> Array:
-        return np.asarray(np.linalg.lstsq(self._normal, self._moment, rcond=1e-12)[0])
+    def forget_turn(self) -> None:
+        """Start anew with pitch and roll, for a rig that was turned; the lateness stays."""
+        self._turn_moment, self._turn_information = np.zeros(2), np.zeros((2, 2))
+
+    def _reckon(self) -> tuple[float, float]:
+        """Return the lateness to reckon with and the doubt in it: the last sharp one, else the expected one."""
+        late_s, sigma_s = self._measured_late()
+        if sigma_s < SHARP_S:
+            if not self.sharp:
+                self.forget_turn()
+            self.sharp, self._reckoned_s = True, (late_s, sigma_s)
+        return self._reckoned_s or (self.expected_late_s, self.expected_late_s)
+
+    def _fade(self) -> None:
+        self._late_moment *= self.memory
+        self._late_information *= self.memory
+        self._turn_moment = self.memory * self._turn_moment
+        self._turn_information = self.memory * self._turn_information
+        self._square *= self.memory
+        self._count *= self.memory
+
+    def _add_late(self, travel: Array, turns: Array, dv: Array, noise_px: float) -> None:
+        """Regress on the part of the travel that no turn of this frame could have made."""
+        basis, _ = np.linalg.qr(turns)
+        travel = travel - basis @ (basis.T @ travel)
+        self._late_moment += float(travel @ dv) / noise_px**2
+        self._late_information += float(travel @ travel) / noise_px**2
+
+    def _add_turn(self, columns: Array, dv: Array, noise_px: float, late_s: float) -> None:
+        """Weigh this frame's pitch and roll by its points' noise and by how the rig may turn within `late_s`."""
+        information = columns.T @ columns / noise_px**2 + 1e-3 * np.eye(2)
+        turn = np.linalg.solve(information, columns.T @ dv / noise_px**2)
+        meanwhile = (late_s * TURN_RATE_SIGMA_RAD_S) ** 2 * np.eye(2)
+        weight = np.linalg.inv(np.linalg.inv(information) + meanwhile)
+        self._turn_moment = self._turn_moment + weight @ turn
+        self._turn_information = self._turn_information + weight
+
+    def _measured_late(self) -> tuple[float, float]:
+        if self._late_information < 1e-3:
+            return 0.0, math.inf
+        return self._late_moment / self._late_information, 1.0 / math.sqrt(self._late_information)
 
     def _fit(self) -> RowFit:
-        solution = self._solution()
-        left_over = max(0.0, self._square - float(solution @ self._moment)) / max(1.0, self._count - 3.0)
-        residual_px = math.sqrt(left_over)
-        sigma = _sigmas(self._normal, max(residual_px, 0.02))
-        late, pitch, roll = (float(value) for value in solution)
-        return RowFit(late, sigma[0], pitch, sigma[1], roll, sigma[2], residual_px, round(self._count))
+        late_s, late_sigma_s = self._measured_late()
+        if self._count < MIN_POINTS or not self._turn_information.any():
+            return RowFit(0.0, math.inf, 0.0, math.inf, 0.0, math.inf, math.nan, 0)
+        pitch, roll = (float(angle) for angle in np.linalg.solve(self._turn_information, self._turn_moment))
+        pitch_sigma, roll_sigma = (float(s) for s in np.sqrt(np.diag(np.linalg.inv(self._turn_information))))
+        residual_px = math.sqrt(self._square / self._count)
+        return RowFit(late_s, late_sigma_s, pitch, pitch_sigma, roll, roll_sigma, residual_px, round(self._count))
 
 
-def _consistent(causes: Array, dv_px: Array) -> NDArray[np.bool_]:
-    """Return which offsets one explanation fits, by least squares on ever fewer points (three rounds)."""
-    kept = np.ones(len(dv_px), dtype=np.bool_)
+def _turn_columns(offsets: RowOffsets, pinhole: Pinhole) -> Array:
+    """Return how the rows (n, 3) change per radian of pitch, yaw and roll of the right eye."""
+    x = (offsets.uv[:, 0] - offsets.d_px - pinhole.cx_px) / pinhole.f_px
+    y = (offsets.uv[:, 1] - pinhole.cy_px) / pinhole.f_px
+    return np.asarray(pinhole.f_px * np.stack([1.0 + y * y, -x * y, -x], axis=1))
+
+
+def _least_squares(columns: Array, values: Array) -> Array:
+    return np.asarray(np.linalg.lstsq(columns, values, rcond=1e-9)[0])
+
+
+def _consistent(columns: Array, values: Array) -> NDArray[np.bool_]:
+    """Return which values one explanation fits, by least squares on ever fewer of them (three rounds)."""
+    kept = np.ones(len(values), dtype=np.bool_)
     for _ in range(3):
         if kept.sum() < MIN_POINTS:
-            return np.zeros(len(dv_px), dtype=np.bool_)
-        solution = np.linalg.lstsq(causes[kept], dv_px[kept], rcond=1e-9)[0]
-        off = np.abs(dv_px - causes @ solution)
+            return np.zeros(len(values), dtype=np.bool_)
+        off = np.abs(values - columns @ _least_squares(columns[kept], values[kept]))
         kept = off <= max(0.1, 2.5 * 1.4826 * float(np.median(off)))
     return kept
-
-
-def _sigmas(normal: Array, residual_px: float) -> tuple[float, float, float]:
-    """Return one sigma of each unknown, inf for those that the normal equations leave open."""
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-12))
-    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
-    open_ = values < 1e-6
-    spread = (vectors**2) @ np.where(open_, np.inf, 1.0 / np.maximum(values, 1e-6)) if not open_.any() else None
-    if spread is None:
-        touched = (vectors[:, open_] ** 2).sum(axis=1) > 1e-6
-        known = (vectors[:, ~open_] ** 2) @ (1.0 / values[~open_])
-        spread = np.where(touched, np.inf, known)
-    late, pitch, roll = (float(s) for s in residual_px * np.sqrt(spread) / scale)
-    return late, pitch, roll
