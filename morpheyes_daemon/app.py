@@ -28,7 +28,7 @@ from morpheyes_daemon.devices.servo import Servo
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.doctor.parameter_rules import examine_parameters
 from morpheyes_daemon.errors import DeviceError
-from morpheyes_daemon.messages import Event, Perception, VehicleState
+from morpheyes_daemon.messages import Event, Perception, Track, VehicleState
 from morpheyes_daemon.perception import VisionJob, build_strategy
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import Gate, GateOutput, StickLimits
@@ -98,6 +98,7 @@ class Daemon:
         fixed_m = config.baseline_range_m[0]
         self._where = self._model or FixedBaseline(fixed_m)
         self.hub.on_vehicle(self._on_vehicle)
+        topics.track.tap(self._tell_track)
         events.subscribe(self._on_event)
         self.hub.parameters.on_change(self._on_parameters)
         self._stops: tuple[str, ...] = ()
@@ -257,6 +258,16 @@ class Daemon:
         self.events.publish(Event(step.t_ns, "guardian", step.reason, text))
         severity = 4 if step.after in (State.BRAKING, State.HOLD, State.FAULT) else 6
         self.hub.send_statustext(severity, f"MorphEyes {step.after}: {step.reason}")
+
+    def _tell_track(self, track: Track) -> None:
+        """A moving object: for ground stations where it is and how it moves (ned), for the log its depth and sigma.
+
+        Messages that the autopilot would act on (LANDING_TARGET, FOLLOW_TARGET) are left alone on purpose.
+        """
+        self.hub.send_debug_vector("me_obj_p", *track.p_ned_m)
+        self.hub.send_debug_vector("me_obj_v", *track.v_ned_m_s)
+        self.hub.send_named_float("me_obj_z", track.p_rect_m[2] if track.seen else math.nan)
+        self.hub.send_named_float("me_obj_sd", math.sqrt(float(track.covariance[:3, :3].trace())))
 
     def _tell(self, report: Health) -> None:
         """Into the autopilot's own log: state, reason, baseline, nearest depth, frame age."""

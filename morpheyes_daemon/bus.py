@@ -18,6 +18,7 @@ from morpheyes_daemon.messages import (
     Perception,
     StereoFrame,
     Sticks,
+    Track,
     VehicleState,
 )
 
@@ -110,6 +111,7 @@ class Topics:
     perception: Latest[Perception] = _topic(1, "depth summary and the strategy's percept per frame")
     vehicle: Latest[VehicleState] = _topic(5, "attitude, velocity, mode, RC as the autopilot reports them")
     observation: Latest[Any] = _topic(1, "what the strategy decided on, for replay")
+    track: Latest[Track] = _topic(1, "the moving object that is being followed")
     command: Latest[MissionCommand] = _topic(1, "what the mission wants")
     governed: Latest[Governed] = _topic(5, "speed limit and the bound that set it")
     sticks: Latest[Sticks] = _topic(1, "stick positions offered to the gate")

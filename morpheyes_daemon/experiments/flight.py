@@ -304,8 +304,7 @@ async def _report(stage: Stage, daemon: Daemon, watchers: Watchers, began_ns: in
     while True:
         now_ns = clock.now_ns()
         truth = stage.truth(now_ns)
-        goal = stage.world.goal_ned_m
-        distance = ((truth.p_ned_m[0] - goal[0]) ** 2 + (truth.p_ned_m[1] - goal[1]) ** 2) ** 0.5
+        distance = stage.world.to_goal_m(truth.p_ned_m)
         speed = (truth.v_ned_m_s[0] ** 2 + truth.v_ned_m_s[1] ** 2) ** 0.5
         phase = str(daemon.guardian.state)
         watchers.progress(Progress((now_ns - began_ns) / S, phase, distance, speed, stage.baseline_m(now_ns)))

@@ -28,7 +28,7 @@ def scene_of(world: World) -> Scene:
     return Scene(
         discs=tuple(Disc(disc.x_m, disc.y_m, disc.radius_m) for disc in world.discs),
         start_m=world.start_ned_m[:2],
-        goal_m=world.goal_ned_m[:2],
+        goal_m=world.goal_ned_m[:2] if world.goal_ned_m else None,
     )
 
 

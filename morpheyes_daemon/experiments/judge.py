@@ -115,8 +115,7 @@ class Judge:
         if not self._engaged_ns or state is not State.HOLD:
             return None
         if reason is Reason.GOAL_REACHED:
-            goal, truth = self._stage.world.goal_ned_m, self._stage.truth(now_ns)
-            off_m = math.hypot(truth.p_ned_m[0] - goal[0], truth.p_ned_m[1] - goal[1])
+            off_m = self._stage.world.to_goal_m(self._stage.truth(now_ns).p_ned_m)
             if off_m <= GOAL_TOLERANCE_M:
                 return Outcome.REACHED, reason
             return Outcome.ABORTED, f"believed to be at the goal, {off_m:.1f} m from it"

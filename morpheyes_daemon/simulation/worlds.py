@@ -7,6 +7,7 @@ that kind's parameters; the seed plants it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -56,15 +57,21 @@ class WorldFile(Section):
 class World:
     """A planted world: what is seen, what is hit, where a flight starts and where it should end (ned).
 
-    `discs` are trunks for the map, `gaps` the walls with openings.
+    `discs` are trunks for the map, `gaps` the walls with openings. Where there is no place to reach (a room to watch
+    something in) the goal is None, and a flight is over when the mission says so.
     """
 
     scene: Scene
     collisions: CollisionWorld
     start_ned_m: tuple[float, float, float]
-    goal_ned_m: tuple[float, float, float]
+    goal_ned_m: tuple[float, float, float] | None
     discs: tuple[Disc, ...] = ()
     gaps: tuple[GapTruth, ...] = ()
+
+    def to_goal_m(self, p_ned_m: Sequence[float]) -> float:
+        """Return the horizontal distance from a place to the goal, 0 where there is none."""
+        goal = self.goal_ned_m
+        return 0.0 if goal is None else math.hypot(p_ned_m[0] - goal[0], p_ned_m[1] - goal[1])
 
     def clearance_m(
         self, p_ned_m: Array, R_ned_frd: Array, shape: VehicleShape, baseline_m: float, t_s: float = 0.0
@@ -97,7 +104,7 @@ def build_world(file: WorldFile, seed: int) -> World:
         case GapWorld():
             return _world(gap_contents(world, seed, Light()), Light(), _behind_wall_m(world))
         case RoomWorld():
-            return _world(room_contents(world, LAMPS), LAMPS, world.length_m - world.behind_m - 2.0, with_sky=False)
+            return _world(room_contents(world, LAMPS, seed), LAMPS, None, with_sky=False)
         case MixedWorld():
             return _world(_mixed(world, seed, Light()), Light(), world.forest.course_m)
 
@@ -113,7 +120,7 @@ def _mixed(world: MixedWorld, seed: int, light: Light) -> Contents:
     return found if world.cube is None else found + cube_contents(world.cube, light)
 
 
-def _world(contents: Contents, light: Light, goal_m: float, with_sky: bool = True) -> World:
+def _world(contents: Contents, light: Light, goal_m: float | None, with_sky: bool = True) -> World:
     sky = sky_mesh() if with_sky else None
     shown = [*contents.meshes, *(mesh for body in contents.moving for mesh in body.meshes), *([sky] if sky else [])]
     materials = materials_of(shown, contents.materials)
@@ -121,7 +128,8 @@ def _world(contents: Contents, light: Light, goal_m: float, with_sky: bool = Tru
         contents.meshes, materials, textures_of(materials.values(), contents.textures), light, sky, contents.moving
     )
     collisions = CollisionWorld(contents.solids, contents.obstacles)
-    start, goal = (0.0, 0.0, -FLYING_HEIGHT_M), (goal_m, 0.0, -FLYING_HEIGHT_M)
+    start = (0.0, 0.0, -FLYING_HEIGHT_M)
+    goal = None if goal_m is None else (goal_m, 0.0, -FLYING_HEIGHT_M)
     return World(scene, collisions, start, goal, contents.discs, contents.gaps)
 
 

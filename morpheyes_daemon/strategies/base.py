@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from morpheyes_daemon.config import Footprint, Section
-from morpheyes_daemon.messages import DepthMap, DepthSummary, Image, MissionCommand, Vector, VehicleState
+from morpheyes_daemon.messages import DepthMap, DepthSummary, Image, MissionCommand, Track, Vector, VehicleState
 from morpheyes_daemon.transforms import R_from_rpy
 
 
@@ -88,6 +88,10 @@ class Strategy(ABC):
 
     def perceive(self, view: View) -> Any:
         """Return what `decide` needs of one frame; picklable and small. Called in the vision worker."""
+        return None
+
+    def track(self, percept: Any) -> Track | None:
+        """Return the moving object that a percept tells of, for topic, log and autopilot; None when there is none."""
         return None
 
     @abstractmethod

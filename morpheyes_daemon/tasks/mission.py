@@ -62,6 +62,9 @@ async def mission(
         seen = await percepts.next()
         observation = observe(seen, track, vehicle, guardian, clock.now_ns(), reaction_s)
         topics.observation.publish(observation)
+        followed = strategy.track(seen.percept)
+        if followed is not None:
+            topics.track.publish(followed)
         command = strategy.decide(observation)
         topics.command.publish(command)
         guardian.gate.renew(Lease.MISSION, command.expires_ns)

@@ -145,6 +145,11 @@ class AutopilotHub:
             dialect.MAVLink_named_value_int_message(self._boot_ms(), name.encode()[:10], value)
         )
 
+    def send_debug_vector(self, name: str, x: float, y: float, z: float) -> None:
+        """Show three values under a name of up to ten characters on ground stations; the autopilot acts on none."""
+        stamp_us = self._clock.now_ns() // 1000
+        self.transmitter.send_status(dialect.MAVLink_debug_vect_message(name.encode()[:10], stamp_us, x, y, z))
+
     def send_obstacle_distance(self, sectors_m: NDArray[np.float32], h_fov_rad: float, max_m: float) -> None:
         """Send the nearest obstacle of 72 sectors (see wire/obstacle_distance.py); call at 10 Hz or more."""
         message = obstacle_distance_message(sectors_m, h_fov_rad, max_m, self._clock.now_ns())

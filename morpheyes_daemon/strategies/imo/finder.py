@@ -1,0 +1,225 @@
+"""Finds a moving object and keeps it: clusters of moving tracklets become tracks, tracks are seen again in each frame.
+
+A track is confirmed when it was seen and moved in several frames; from then on its own pixels are looked for where
+the filter expects them, so that it is kept while it is slow, tiny or very near. While it is not seen the filter
+coasts and the search widens; after `coast_s` it is given up.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from morpheyes_daemon.clock import S
+from morpheyes_daemon.messages import DepthMap, Track
+from morpheyes_daemon.strategies.base import View
+from morpheyes_daemon.strategies.imo.clusters import Cluster, clusters
+from morpheyes_daemon.strategies.imo.filter import (
+    REGISTERED_PX,
+    SHAPE_SHARE,
+    Eyes,
+    ObjectFilter,
+    measurement_covariance,
+)
+from morpheyes_daemon.strategies.imo.frames import Frame
+from morpheyes_daemon.strategies.imo.tracklets import CHAIN, Tracklets
+from morpheyes_daemon.strategies.imo.window import Expected, Sighting, sight
+from morpheyes_daemon.transforms import Array, inverse
+
+HITS, OF = 3, 5
+"""A track is confirmed when it moved visibly in so many of so many frames."""
+
+STILL_S = 4.0
+"""A track without any sign of own motion for so long is part of the scene."""
+
+GATE = 30.0
+"""Squared Mahalanobis length up to which a sighting belongs to the track."""
+
+LARGEST_M, SMALLEST_M = 1.5, 0.04
+"""Radii of what is taken for an object."""
+
+RADIUS_GAIN = 0.15
+
+MIDDLE_PX = 3.0
+"""By how much the middle of an object's pixels wanders without its moving, at 640 px of image width."""
+
+
+@dataclass(slots=True, eq=False)
+class _Candidate:
+    """A track on its way: its filter, the object's radius, and in which of the last frames it was seen to move."""
+
+    id: int
+    filter: ObjectFilter
+    radius_m: float
+    born_ns: int
+    moved: deque[bool] = field(default_factory=lambda: deque(maxlen=OF))
+    confirmed: bool = False
+    seen_ns: int = 0
+    moved_ns: int = 0
+    sighting: Sighting | None = None
+    places: deque[tuple[int, Array]] = field(default_factory=lambda: deque(maxlen=CHAIN))
+
+
+class Finder:
+    """One object at a time, as the paper has it; `step` once per frame, in order."""
+
+    def __init__(self, coast_s: float = 2.0) -> None:
+        self._coast_ns = round(coast_s * S)
+        self.tracklets = Tracklets()
+        self._before: Frame | None = None
+        self._candidates: list[_Candidate] = []
+        self._next_id = 1
+        self.clusters: list[Cluster] = []
+
+    def step(self, view: View) -> Track | None:
+        """Return the track as of this frame, None while nothing confirmed is being followed."""
+        frame = Frame.of(view)
+        best = self._candidates[0] if self._candidates else None
+        watched = best.sighting.mask if best and best.sighting else None
+        movers = self.tracklets.step(frame, self._own_shift(frame, best), watched)
+        self.clusters = clusters(movers, frame)
+        dt_s = (frame.t_ns - self._before.t_ns) / S if self._before else 0.0
+        for candidate in self._candidates:
+            self._see(candidate, frame, view.depth, dt_s)
+        self._adopt(frame, view.depth)
+        self._weed(frame.t_ns)
+        best = self._candidates[0] if self._candidates else None
+        self.tracklets.replenish(frame, best.sighting.mask if best and best.sighting else None)
+        if self._before is not None and not (best and best.confirmed):
+            self.tracklets.attend(self._before, frame)
+        self._before = frame
+        return self._track(best, frame, view.depth) if best and best.confirmed else None
+
+    def _own_shift(self, frame: Frame, best: _Candidate | None) -> Array | None:
+        """How far (3,) the object has moved by itself since the frame before, in the present rect axes."""
+        if best is None or self._before is None:
+            return None
+        dt_s = (frame.t_ns - self._before.t_ns) / S
+        return np.asarray(frame.T_ned_rect[:3, :3].T @ best.filter.v_ned_m_s * dt_s)
+
+    def _see(self, candidate: _Candidate, frame: Frame, depth: DepthMap, dt_s: float) -> None:
+        candidate.filter.predict(dt_s)
+        sighting = sight(frame, _expected(candidate, frame))
+        candidate.sighting = None
+        if sighting is not None:
+            p_ned, covariance = _measured(sighting, frame, depth)
+            if candidate.filter.surprise(p_ned, covariance) < GATE:
+                candidate.filter.update(p_ned, covariance)
+                candidate.sighting, candidate.seen_ns = sighting, frame.t_ns
+                if sighting.whole:
+                    fresh = min(max(sighting.radius_m, SMALLEST_M), LARGEST_M)
+                    candidate.radius_m += RADIUS_GAIN * (fresh - candidate.radius_m)
+
+    def _adopt(self, frame: Frame, depth: DepthMap) -> None:
+        """Tell candidates which clusters are theirs; make new candidates of the rest."""
+        moved: set[int] = set()
+        for cluster in self.clusters:
+            p_ned = frame.T_ned_rect[:3, :3] @ cluster.p_rect + frame.T_ned_rect[:3, 3]
+            owner = next((c for c in self._candidates if _owns(c, p_ned, cluster)), None)
+            if owner is not None:
+                moved.add(owner.id)
+            elif cluster.radius_m < LARGEST_M and len(self._candidates) < 4:
+                moved.add(self._begin(cluster, p_ned, frame, depth))
+        for candidate in self._candidates:
+            hit = candidate.id in moved and candidate.sighting is not None
+            candidate.moved.append(hit)
+            if hit or self._has_moved(candidate, frame):
+                candidate.moved_ns = frame.t_ns
+            if candidate.sighting is not None:
+                candidate.places.append((frame.t_ns, candidate.sighting.p_rect))
+            candidate.confirmed |= sum(candidate.moved) >= HITS
+
+    def _has_moved(self, candidate: _Candidate, frame: Frame) -> bool:
+        """Tell whether the object is elsewhere than some seconds ago, by the vehicle's refined motion since."""
+        if candidate.sighting is None or len(candidate.places) < 3:
+            return False
+        now = frame.project(candidate.sighting.p_rect)
+        for t_ns, p_then in candidate.places:
+            past = self.tracklets.since(t_ns)
+            if past is not None and frame.t_ns - t_ns > S // 2:
+                still = frame.project(past.T_now_then[:3, :3] @ p_then + past.T_now_then[:3, 3])
+                wander_px = MIDDLE_PX * frame.scale + SHAPE_SHARE * candidate.radius_m * now[2] / frame.baseline_m
+                allowed = np.array([wander_px, wander_px, 3.0 * REGISTERED_PX + 0.01 * now[2]])
+                if (np.abs(now - still) > 2.0 * allowed).any():
+                    return True
+        return False
+
+    def _begin(self, cluster: Cluster, p_ned: Array, frame: Frame, depth: DepthMap) -> int:
+        covariance = _in_ned(frame, measurement_covariance(cluster.p_rect, cluster.radius_m, _eyes(depth)))
+        v_ned = frame.T_ned_rect[:3, :3] @ cluster.v_rect_m_s
+        radius_m = max(cluster.radius_m, SMALLEST_M)
+        covariance = covariance + np.eye(3) * (0.3 * radius_m) ** 2
+        candidate = _Candidate(self._next_id, ObjectFilter(p_ned, covariance, 0.5 * v_ned), radius_m, frame.t_ns)
+        candidate.sighting = sight(frame, _expected(candidate, frame))
+        candidate.seen_ns = candidate.moved_ns = frame.t_ns
+        self._next_id += 1
+        self._candidates.append(candidate)
+        return candidate.id
+
+    def _weed(self, t_ns: int) -> None:
+        """Drop what is gone, what stands still, and what never became a track; the best first."""
+        kept = [c for c in self._candidates if self._lives(c, t_ns)]
+        kept.sort(key=lambda c: (not c.confirmed, -sum(c.moved), c.born_ns))
+        confirmed = [c for c in kept if c.confirmed]
+        self._candidates = confirmed[:1] + [c for c in kept if not c.confirmed]
+
+    def _lives(self, candidate: _Candidate, t_ns: int) -> bool:
+        if not candidate.confirmed:
+            return t_ns - candidate.born_ns <= 2 * S and any(candidate.moved)
+        return t_ns - candidate.seen_ns <= self._coast_ns and t_ns - candidate.moved_ns <= STILL_S * S
+
+    def _track(self, candidate: _Candidate, frame: Frame, depth: DepthMap) -> Track:
+        sighting = candidate.sighting
+        x = candidate.filter.x
+        return Track(
+            seq=depth.seq,
+            t_ns=frame.t_ns,
+            id=candidate.id,
+            seen=sighting is not None,
+            p_ned_m=(float(x[0]), float(x[1]), float(x[2])),
+            v_ned_m_s=(float(x[3]), float(x[4]), float(x[5])),
+            covariance=candidate.filter.P.copy(),
+            p_rect_m=_triple(sighting.p_rect if sighting else _to_rect(frame, candidate.filter.p_ned_m)),
+            radius_m=candidate.radius_m,
+            pixels=int(sighting.mask.sum()) if sighting else 0,
+            baseline_m=depth.baseline_m,
+        )
+
+
+def _expected(candidate: _Candidate, frame: Frame) -> Expected:
+    P_rect = frame.T_ned_rect[:3, :3].T @ candidate.filter.P[:3, :3] @ frame.T_ned_rect[:3, :3]
+    p_rect = _to_rect(frame, candidate.filter.p_ned_m)
+    return Expected(
+        p_rect, float(np.sqrt(max(P_rect[0, 0], P_rect[1, 1]))), float(np.sqrt(P_rect[2, 2])), candidate.radius_m
+    )
+
+
+def _measured(sighting: Sighting, frame: Frame, depth: DepthMap) -> tuple[Array, Array]:
+    covariance = measurement_covariance(sighting.p_rect, sighting.radius_m, _eyes(depth))
+    p_ned = frame.T_ned_rect[:3, :3] @ sighting.p_rect + frame.T_ned_rect[:3, 3]
+    return p_ned, _in_ned(frame, covariance)
+
+
+def _eyes(depth: DepthMap) -> Eyes:
+    return Eyes(depth.baseline_m, depth.pinhole.f_px, depth.baseline_sigma_m)
+
+
+def _owns(candidate: _Candidate, p_ned: Array, cluster: Cluster) -> bool:
+    reach = candidate.radius_m + cluster.radius_m + 3.0 * float(np.sqrt(candidate.filter.P[:3, :3].trace()))
+    return float(np.linalg.norm(p_ned - candidate.filter.p_ned_m)) < reach
+
+
+def _in_ned(frame: Frame, covariance: Array) -> Array:
+    R = frame.T_ned_rect[:3, :3]
+    return np.asarray(R @ covariance @ R.T)
+
+
+def _to_rect(frame: Frame, p_ned: Array) -> Array:
+    T = inverse(frame.T_ned_rect)
+    return np.asarray(T[:3, :3] @ p_ned + T[:3, 3])
+
+
+def _triple(p: Array) -> tuple[float, float, float]:
+    return float(p[0]), float(p[1]), float(p[2])
