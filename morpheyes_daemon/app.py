@@ -220,7 +220,14 @@ class Daemon:
     def _on_event(self, event: Event) -> None:
         if event.source != "guardian" and event.reason in ALARMS:
             self.guardian.alarm(event.reason, event.t_ns)
-        if event.source == "servo" and event.reason in ALARMS and self._model is not None:
+        if event.source == "servo":
+            self._heed_servo(event)
+
+    def _heed_servo(self, event: Event) -> None:
+        """Until the Teensy answers again the eyes may be anywhere on their way, and nobody engages."""
+        lost = event.reason in ALARMS
+        self.guardian.set_missing(event.reason if lost else None, "servo")
+        if lost and self._model is not None:
             self._model.doubt(self._model.at(event.t_ns).target_m, event.t_ns)
 
     def _on_parameters(self, values: Mapping[str, float]) -> None:

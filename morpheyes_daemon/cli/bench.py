@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from morpheyes_daemon.cli.bench_gap import gap, gap_images
 from morpheyes_daemon.cli.progress import progress_line
 
 if TYPE_CHECKING:
@@ -21,6 +22,9 @@ Size = Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3
 Repeats = Annotated[int, typer.Option(min=3, help="Timed runs; the first two are warm-up and left out.")]
 Calibration = Annotated[str, typer.Option(help="'solved' from rendered boards, 'exact', or a calibration file.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the figures as JSON and nothing else.")]
+
+app.command()(gap)
+app.command("gap-images")(gap_images)
 
 LIMIT_P99_S, LIMIT_MAX_S = 0.025, 0.100
 LIMIT_GROWTH_PCT = 5.0
@@ -123,6 +127,32 @@ def latency(
 
 
 @app.command()
+def takeover(
+    trials: Annotated[int, typer.Option(min=1, help="Take-overs at random moments.")] = 1000,
+    size: Size = "320x240",
+    calibration: Calibration = "exact",
+    as_json: AsJson = False,
+) -> None:
+    """Measure how soon the pilot has the sticks, by switch and by mode, in lockstep forest flights.
+
+    Exit code 1 when one release came later than 50 ms after the pilot's message, or a stick was held after it.
+    """
+    from morpheyes_daemon.experiments.takeover import bench_takeover
+
+    plan = _plan(size, calibration, 5.0, 5.0)
+    with progress_line() as report:
+        found = bench_takeover(plan, trials, report)
+    rows = [
+        ("take-overs", f"{found.trials}, {found.failed} failed, {found.held_after} sticks held after the release"),
+        ("message to release", f"{found.arrival_to_release_max_ms:.1f} ms at most"),
+        *((f"{way} to release", _hand(times)) for way, times in found.hand_to_release_ms.items()),
+    ]
+    _say(asdict(found), rows, as_json)
+    if found.failed:
+        raise typer.Exit(1)
+
+
+@app.command()
 def render(size: Size = "640x480", repeats: Repeats = 20, as_json: AsJson = False) -> None:
     """Time the simulator's rendering of a stereo pair."""
     from morpheyes_daemon.experiments.bench_vision import bench_render
@@ -158,6 +188,13 @@ def _live(quiet: bool, run: Callable[[Callable[[Progress], None]], Any]) -> Any:
 def _times(times: Times) -> str:
     p95, most = f"p95 {times.p95_ms:.1f} ms", f"largest {times.max_ms:.1f} ms"
     return f"{times.median_ms:.1f} ms median, {p95}, {most} of {times.repeats}"
+
+
+def _hand(times: dict[str, float]) -> str:
+    if not times["count"]:
+        return "never"
+    median, p99, largest = (f"{times[key]:.0f} ms" for key in ("median", "p99", "max"))
+    return f"{median} median, p99 {p99}, largest {largest} of {times['count']}"
 
 
 def _beat(p50_s: float, p99_s: float, max_s: float) -> str:

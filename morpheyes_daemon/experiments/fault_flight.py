@@ -93,7 +93,7 @@ class FaultFlight:
         self.rng = random.Random(f"faults {plan.scenario.seed}")
         topics, events = Topics.create(), EventLog()
         self.topics = topics
-        self.stage = Stage(plan.scenario, plan.config, self.clock, plan.render_threads)
+        self.stage = Stage(plan.scenario, plan.config, self.clock, 1)  # threads would not survive a fork
         self.stage.autopilot.parameters.set("RSSI_TYPE", 3)
         self.crew = make_crew(self.stage)
         opener = memory_opener(self.stage)
@@ -138,6 +138,11 @@ class FaultFlight:
     def state(self) -> State:
         """Where the daemon is."""
         return self.daemon.guardian.state
+
+    @property
+    def sent(self) -> list[tuple[int, Sent]]:
+        """Every override on the wire: when, and what it asked for."""
+        return self._sent
 
     # -- getting there ------------------------------------------------------------------------------------------
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-import os
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,10 @@ import cv2
 
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.errors import CalibrationError, UsageError
+from morpheyes_daemon.experiments.branch import Branch, branch
+from morpheyes_daemon.experiments.fault_endings import REACTION_S, RELEASE_S, Ending, Fault, complaints
 from morpheyes_daemon.experiments.fault_flight import FaultFlight, Measured
-from morpheyes_daemon.experiments.faults import FAULTS, REACTION_S, RELEASE_S, Ending, Fault, complaints
+from morpheyes_daemon.experiments.faults import FAULTS
 from morpheyes_daemon.experiments.flight import FlightPlan
 from morpheyes_daemon.experiments.plan import with_seed
 from morpheyes_daemon.safety.states import State
@@ -106,7 +108,7 @@ def load_rows(path: Path) -> list[Row]:
     """Return the rows that a run before has left in a file, one JSON object a line; none when there is no file."""
     if not path.exists():
         return []
-    return [_row_of(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+    return [_row_of(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines() if line]
 
 
 def store_row(path: Path, row: Row) -> None:
@@ -115,8 +117,7 @@ def store_row(path: Path, row: Row) -> None:
         file.write(json.dumps(asdict(row)) + "\n")
 
 
-def _row_of(text: str) -> Row:
-    values = json.loads(text)
+def _row_of(values: dict[str, Any]) -> Row:
     return Row(**{**values, "complaints": tuple(values["complaints"])})
 
 
@@ -145,54 +146,32 @@ def _fly_alone(plan: FlightPlan, fault: Fault, done: Callable[[Row], None]) -> N
 async def _fly_state(
     plan: FlightPlan, state: State, faults: list[Fault], jobs: int, done: Callable[[Row], None]
 ) -> None:
-    running: deque[_Branch] = deque()
+    running: deque[tuple[Fault, Branch]] = deque()
+
+    def collect() -> None:
+        fault, child = running.popleft()
+        told = child.result()
+        died = make_row(fault, state, plan.scenario.seed, None, ("the simulation died",))
+        done(_row_of(told) if told is not None else died)
+
     with tempfile.TemporaryDirectory() as folder:
         async with FaultFlight(plan, Path(folder)) as flight:
             await flight.reach(state)
             for fault in faults:
                 if len(running) == jobs:
-                    done(running.popleft().row())
-                running.append(await _branch(flight, state, fault))
+                    collect()
+                running.append((fault, await branch(partial(_report, flight, state, fault))))
             while running:
-                done(running.popleft().row())
+                collect()
 
 
-@dataclass(frozen=True, slots=True)
-class _Branch:
-    """A child in which one fault takes its course."""
-
-    fault: Fault
-    state: State
-    seed: int
-    pid: int
-    answer: int
-
-    def row(self) -> Row:
-        """Wait for the child and return what it saw."""
-        with os.fdopen(self.answer, encoding="utf-8") as file:
-            text = file.read()
-        os.waitpid(self.pid, 0)
-        if not text:
-            return make_row(self.fault, self.state, self.seed, None, ("the simulation died",))
-        return _row_of(text)
-
-
-async def _branch(flight: FaultFlight, state: State, fault: Fault) -> _Branch:
-    """Fork; the parent returns at once and stands still, the child breaks something and never returns."""
-    seed = flight.plan.scenario.seed
-    loop = asyncio.get_running_loop()
-    answer, writer = os.pipe()
-    pid = os.fork()
-    if pid:
-        os.close(writer)
-        return _Branch(fault, state, seed, pid, answer)
-    asyncio._set_running_loop(loop)  # asyncio remembers in which process its loop runs
+async def _report(flight: FaultFlight, state: State, fault: Fault) -> dict[str, Any]:
+    """Try one fault in a process of its own; whatever happens there is a row."""
     try:
         row = await _try(flight, state, fault)
     except Exception as error:  # noqa: BLE001 -- the whole life of a process
-        row = make_row(fault, state, seed, None, (f"{type(error).__name__}: {error}",))
-    os.write(writer, json.dumps(asdict(row)).encode())
-    os._exit(0)
+        row = make_row(fault, state, flight.plan.scenario.seed, None, (f"{type(error).__name__}: {error}",))
+    return asdict(row)
 
 
 async def _try(flight: FaultFlight, state: State, fault: Fault) -> Row:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from morpheyes_daemon.app import ALARMS
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config import NoServoConfig, SerialServoConfig
+from morpheyes_daemon.messages import Event
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.states import State
 from tests.noisy_daemon import NoisyDaemon
@@ -45,5 +47,36 @@ def test_a_servo_that_never_answered_is_waited_for_in_preflight() -> None:
             assert guardian.missing is Reason.SERVO_LOST
             assert guardian.state is State.PREFLIGHT
             assert State.FAULT not in noisy.states
+
+    run_virtual(life())
+
+
+@pytest.mark.parametrize("trouble", [Reason.BASELINE_STALE, Reason.SERVO_LOST])
+def test_nobody_engages_while_the_servo_is_in_trouble(trouble: Reason) -> None:
+    async def life() -> None:
+        async with NoisyDaemon(NoServoConfig(backend="none")) as noisy:
+            guardian = noisy.daemon.guardian
+            await noisy.pass_time(0.5)
+            assert guardian.state is State.STANDBY
+            for reason, state in ((trouble, State.PREFLIGHT), (Reason.RECOVERED, State.STANDBY)):
+                noisy.daemon.events.publish(Event(noisy.clock.now_ns(), "servo", reason))
+                await noisy.pass_time(0.1)
+                assert guardian.state is state
+                assert guardian.missing is (trouble if state is State.PREFLIGHT else None)
+
+    run_virtual(life())
+
+
+@pytest.mark.parametrize("reason", sorted(ALARMS))
+def test_what_devices_and_images_tell_stops_a_flight_on_the_spot(reason: Reason) -> None:
+    async def life() -> None:
+        async with NoisyDaemon(NoServoConfig(backend="none")) as noisy:
+            guardian = noisy.daemon.guardian
+            await noisy.pass_time(0.5)
+            guardian.machine.state = State.ENGAGED
+            noisy.daemon.events.publish(Event(noisy.clock.now_ns(), "somebody", reason))
+            assert guardian.state is State.BRAKING
+            assert guardian.reason is reason
+            assert noisy.overrides[-1] == (1500, 1500, 1500, 1500), "neutral on the spot"
 
     run_virtual(life())

@@ -1,0 +1,185 @@
+"""What a row of the fault matrix is, how a fault may end, and the rule for each ending. The rows are in `faults`.
+
+Class A: the daemon lives and must act within 250 ms of noticing. Class B: it is dead or cut off, the autopilot's own
+time-out acts, and the vehicle must stop within what the governor had kept free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from morpheyes_daemon.experiments import fault_acts as acts
+from morpheyes_daemon.experiments.fault_flight import Measured, Sent
+from morpheyes_daemon.safety.states import HOLDING, State
+
+REACTION_S = 0.25
+"""From noticing to neutral sticks on the wire."""
+
+RELEASE_S = 0.05
+"""From the pilot's message to the release."""
+
+SETTLED_S = 4.0
+"""After a fault was noticed: neutral for two seconds, a release repeated for one, and some."""
+
+STILL_S = 0.1
+"""A stream whose last message is older than this has ended."""
+
+
+class Ending(StrEnum):
+    """How a fault in a state must end; `complaints` checks each."""
+
+    FLIES = "flies on"
+    RESUMES = "neutral, then flies on"
+    HOLDS = "neutral until the pilot acts"
+    HOLDS_IF_IT_MATTERS = "flies on, or neutral until the pilot acts"
+    RELEASES = "released at once"
+    LETS_GO = "neutral, then released"
+    READY = "stays ready, sends nothing"
+    UNREADY = "is not ready, sends nothing"
+    STOPS = "the autopilot stops it"
+    REFUSES = "the daemon does not start"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One row: `begin` breaks something, `end` mends it after `lasts_s`. `notice_s` is the declared detection time.
+
+    `watch_s` is how long to look on; `falls`: the motors stop, so that hitting something says nothing. `rig_seed`
+    flies another rig than the one that was calibrated, None the calibration missing.
+    """
+
+    name: str
+    what: str
+    notice_s: float
+    endings: Mapping[State, Ending]
+    begin: acts.Act = lambda flight: None
+    end: acts.Act = lambda flight: None
+    lasts_s: float | None = None
+    watch_s: float = 7.0
+    falls: bool = False
+    rig_seed: int | None = 0
+
+    def watched_s(self, state: State) -> float:
+        """How long to look on: less where nothing moves that would have to stop."""
+        settled_s = self.notice_s + (self.lasts_s or 0.0) + SETTLED_S
+        return self.watch_s if state in (State.ENGAGED, State.BRAKING) else min(self.watch_s, settled_s)
+
+    @property
+    def kind(self) -> str:
+        """A: the daemon lives. B: it is dead or cut off."""
+        return "B" if Ending.STOPS in self.endings.values() else "A"
+
+
+def complaints(fault: Fault, state: State, seen: Measured) -> list[str]:
+    """Return what did not end as the table says; empty when all did."""
+    ending = fault.endings[state]
+    found = list(_RULES[ending](fault, state, seen))
+    ours = not fault.falls and ending is not Ending.RELEASES
+    if seen.clearance_m < 0.0 and ours:
+        found.append(f"hit an obstacle ({seen.clearance_m:.2f} m)")
+    return found
+
+
+Complaints = Iterator[str]
+_Rule = Callable[[Fault, State, Measured], Complaints]
+
+
+def _expect(holds: bool, complaint: str) -> Complaints:
+    if not holds:
+        yield complaint
+
+
+def _in(seen: Measured, *states: State) -> Complaints:
+    yield from _expect(seen.state in states, f"ended in {seen.state} ({seen.reason})")
+
+
+def _reacted(fault: Fault, state: State, after_s: float | None) -> Complaints:
+    """Neutral in time; where the sticks were neutral already, they stay so."""
+    limit_s = fault.notice_s + REACTION_S
+    if state is State.ENGAGED:
+        in_time = after_s is not None and after_s <= limit_s
+        yield from _expect(in_time, f"neutral after {after_s} s, allowed {limit_s:.2f} s")
+
+
+def _silent(seen: Measured) -> Complaints:
+    yield from _expect(seen.neutrals == 0 and seen.last in (None, Sent.RELEASE), "moved sticks that are not ours")
+
+
+def _flies(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _in(seen, State.ENGAGED)
+    yield from _expect(seen.last is Sent.STICKS, "does not fly")
+    yield from _expect(seen.neutrals <= 2, f"braked ({seen.neutrals} neutral messages)")
+
+
+def _resumes(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _reacted(fault, state, seen.reaction_s)
+    yield from _in(seen, State.ENGAGED)
+    yield from _expect(seen.sticks_after > 0, "never flew on")
+
+
+def _holds(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _reacted(fault, state, seen.quiet_s)
+    yield from _in(seen, State.HOLD)
+    still = seen.last is Sent.NEUTRAL and seen.last_s is not None and seen.last_s > fault.watched_s(state) - STILL_S
+    yield from _expect(still, "does not hold the sticks neutral")
+    yield from _expect(seen.stopped, "still moves")
+
+
+def _holds_if_it_matters(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _in(seen, State.ENGAGED, State.BRAKING, State.HOLD)
+
+
+def _releases(fault: Fault, state: State, seen: Measured) -> Complaints:
+    limit_s = fault.notice_s + RELEASE_S
+    yield from _expect(seen.state not in HOLDING, f"ended in {seen.state} ({seen.reason})")
+    in_time = seen.release_s is not None and seen.release_s <= limit_s
+    yield from _expect(in_time, f"released after {seen.release_s} s, allowed {limit_s:.2f} s")
+    yield from _gone(seen)
+
+
+def _gone(seen: Measured) -> Complaints:
+    yield from _expect(seen.last is Sent.RELEASE, f"the last message was {seen.last}")
+    yield from _expect(seen.sticks_after == 0, "sticks afterwards")
+
+
+def _lets_go(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _reacted(fault, state, seen.quiet_s)
+    yield from _in(seen, State.PILOT, State.RELEASED)
+    yield from _expect(seen.neutrals > 0, "no neutral before the release")
+    yield from _gone(seen)
+
+
+def _ready(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _in(seen, State.STANDBY)
+    yield from _silent(seen)
+
+
+def _unready(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _expect(seen.state not in (State.STANDBY, State.ENGAGED), f"is ready ({seen.state})")
+    yield from _silent(seen)
+
+
+def _stops(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _expect(seen.stopped, "still moves")
+    yield from _expect(seen.stop_m <= seen.reserved_m, f"stopped after {seen.stop_m:.2f} m of {seen.reserved_m:.2f} m")
+    yield from _expect(seen.sticks_after == 0, "sticks afterwards")
+
+
+def _refuses(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield "the daemon started"
+
+
+_RULES: dict[Ending, _Rule] = {
+    Ending.FLIES: _flies,
+    Ending.RESUMES: _resumes,
+    Ending.HOLDS: _holds,
+    Ending.HOLDS_IF_IT_MATTERS: _holds_if_it_matters,
+    Ending.RELEASES: _releases,
+    Ending.LETS_GO: _lets_go,
+    Ending.READY: _ready,
+    Ending.UNREADY: _unready,
+    Ending.STOPS: _stops,
+    Ending.REFUSES: _refuses,
+}
