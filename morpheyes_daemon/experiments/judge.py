@@ -116,7 +116,7 @@ class Judge:
             return None
         if reason is Reason.GOAL_REACHED:
             off_m = self._stage.world.to_goal_m(self._stage.truth(now_ns).p_ned_m)
-            if off_m <= GOAL_TOLERANCE_M:
+            if off_m <= GOAL_TOLERANCE_M + self._stage.vehicle.drift * self._path_m:
                 return Outcome.REACHED, reason
             return Outcome.ABORTED, f"believed to be at the goal, {off_m:.1f} m from it"
         if reason is Reason.MISSION_REFUSED:

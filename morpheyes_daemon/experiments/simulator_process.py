@@ -159,8 +159,8 @@ async def _fly(job: SimulatorJob, pipe: Connection, stage: Stage, crew: Crew, ur
     began_ns = clock.now_ns()
     try:
         with _hearing(pipe, heard):
+            await exposures.next()  # compiles what is not compiled yet
             async with _background(stage.teensy.run(), frames.run(), _report(stage, heard, pipe, began_ns)):
-                await exposures.next()  # compiles what is not compiled yet
                 await frames.listening.wait()
                 pipe.send(Ready(url, f"serial:{port.path}:115200", scene_of(stage.world).as_json()))
                 await heard.booted.wait()  # or it would find the vehicle flying, and only observe

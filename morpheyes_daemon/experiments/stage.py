@@ -49,9 +49,13 @@ class Scenario:
 
 
 class FlyingVehicle(Protocol):
-    """What flies: the autopilot twin with its vehicle, or a simulator of somebody else's."""
+    """What flies: the autopilot twin with its vehicle, or a simulator of somebody else's.
+
+    `drift` is the share of the way by which its own position estimate may be off at the end, beyond what GPS leaves.
+    """
 
     radio: Radio
+    drift: float
 
     def truth_at(self, t_ns: int) -> Truth:
         """Return where the vehicle was; InputError when that is not known."""

@@ -54,6 +54,7 @@ class AutopilotTwin:
         changes = RECOMMENDED if parameters is None else parameters
         self.parameters = ParameterTable(changes, old_names=old_parameter_names)
         self.radio = radio or Radio()
+        self.drift = 0.0
         vehicle.start_at(clock.now_ns())
         self.autopilot = Autopilot(
             vehicle, self.radio, self.parameters, noise or EstimatorNoise(), seed, ready_after_s, self._say

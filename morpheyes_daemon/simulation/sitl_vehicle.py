@@ -36,6 +36,7 @@ class SitlVehicle:
 
     def __init__(self, link: ByteLink, radio: Radio, clock: Clock) -> None:
         self.radio = radio
+        self.drift = 0.0
         self._link, self._clock = link, clock
         self._start = 0.0, 0.0
         self._mav = mavlink.MAVLink(None, *IDENTITY)
