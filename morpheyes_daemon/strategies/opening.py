@@ -8,10 +8,12 @@ as it is passed: projected along the way through the wall, so a turned wall is a
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from morpheyes_daemon.messages import DepthMap, FloatMap, Pinhole
 from morpheyes_daemon.strategies.wall import Mask, Plane, Split
@@ -31,6 +33,12 @@ BAND_M = 0.06
 
 TUNNEL_M = 0.10
 """Room around the silhouette behind the wall within which things count as in the way."""
+
+SAMPLES = 5000
+"""Pixels of an opening, about, that tell what lies behind it."""
+
+COARSE_PX = 320
+"""Holes are first looked for in about so many columns."""
 
 LEAST_PX = 40
 MOST_OPENINGS = 4
@@ -124,25 +132,47 @@ def passage(plane: Plane, pinhole: Pinhole, T_ned_rect: Array) -> Passage | None
 
 def find_openings(depth: DepthMap, found: Split, way: Passage, silhouette: Silhouette) -> tuple[Opening, ...]:
     """Return the openings of a wall, the largest first."""
-    holes = ~found.wall
     if not found.bimodal:
         return ()
-    height, width = holes.shape
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(holes.view(np.uint8), connectivity=4)
-    order = np.argsort(-stats[1:count, cv2.CC_STAT_AREA])[: 3 * MOST_OPENINGS] + 1
     openings: list[Opening] = []
-    for label in order.tolist():
-        x, y, w, h, area = (int(value) for value in stats[label])
-        if area < LEAST_PX or len(openings) >= MOST_OPENINGS:
-            break
-        pad = max(2, round(BAND_M * depth.pinhole.f_px / max(way.range_m, 0.2)))
-        box = (slice(max(0, y - pad), min(height, y + h + pad)), slice(max(0, x - pad), min(width, x + w + pad)))
-        hole = labels[box] == label
-        if (hole & found.far[box]).sum() < SEEN_THROUGH * area:
+    for box, cut in _candidates(found, depth.pinhole.f_px / max(way.range_m, 0.2)):
+        hole = _largest(~found.wall[box])
+        if hole is None or (hole & found.far[box]).sum() < SEEN_THROUGH * hole.sum():
             continue
-        cut = x == 0 or y == 0 or x + w == width or y + h == height
-        openings.append(_opening(depth, found, way, silhouette, hole, box, pad, cut))
+        openings.append(_opening(depth, found, way, silhouette, hole, box, cut))
+        if len(openings) == MOST_OPENINGS:
+            break
     return tuple(openings)
+
+
+Box = tuple[slice, slice]
+
+
+def _candidates(found: Split, px_per_m: float) -> Iterator[tuple[Box, bool]]:
+    """Yield where holes may be, with a band around them, and whether they touch the image's edge: a coarse look."""
+    height, width = found.wall.shape
+    step = max(1, round(width / COARSE_PX))
+    coarse = np.ascontiguousarray(~found.wall[::step, ::step])
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(coarse.view(np.uint8), connectivity=4)
+    seen = np.bincount(labels[found.far[::step, ::step]], minlength=count)
+    pad = max(2, round(BAND_M * px_per_m)) + step
+    for label in (np.argsort(-stats[1:count, cv2.CC_STAT_AREA])[: 3 * MOST_OPENINGS] + 1).tolist():
+        x, y, w, h, area = (int(value) * step for value in stats[label])
+        if area * step < LEAST_PX:
+            return
+        if seen[label] * step < 0.8 * SEEN_THROUGH * area:
+            continue
+        cut = x == 0 or y == 0 or x + w >= width or y + h >= height
+        yield (slice(max(0, y - pad), min(height, y + h + pad)), slice(max(0, x - pad), min(width, x + w + pad))), cut
+
+
+def _largest(mask: Mask) -> Mask | None:
+    """Return the largest piece of a mask."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=4)
+    if count < 2:
+        return None
+    label = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    return np.asarray(labels == label) if stats[label, cv2.CC_STAT_AREA] >= LEAST_PX else None
 
 
 def _opening(
@@ -151,8 +181,7 @@ def _opening(
     way: Passage,
     silhouette: Silhouette,
     hole: Mask,
-    box: tuple[slice, slice],
-    band_px: int,
+    box: Box,
     cut: bool,
 ) -> Opening:
     corner = np.array([box[1].start, box[0].start], dtype=np.float32)
@@ -160,7 +189,8 @@ def _opening(
     contour = max(outlines, key=len)[:, 0].astype(np.float32) + corner
     far = hole & found.far[box]
     z_m = float(np.median(1.0 / np.maximum(found.plane.at(contour.astype(np.float64)), 1e-3)))
-    raster = _raster(hole, corner, way, silhouette)
+    raster = _raster(hole, contour, corner, way, silhouette)
+    band_px = max(2, round(BAND_M * depth.pinhole.f_px / max(way.range_m, 0.2)))
     u, v = (float(c) for c in _safest_px(hole, far, found.wall[box], band_px) + corner)
     safest = Place(way.ned_of_pixel(u, v), _room_at(raster, way, u, v))
     places = _places(raster, way)
@@ -169,15 +199,14 @@ def _opening(
 
 
 def _beyond_m(
-    depth: DepthMap, box: tuple[slice, slice], far: Mask, way: Passage, place: Place, silhouette: Silhouette
+    depth: DepthMap, box: Box, far: Mask, way: Passage, place: Place, silhouette: Silhouette
 ) -> float:
     """Return how far behind the wall the first thing stands that the vehicle would meet, as far as it is seen.
 
     Only what lies in the tunnel of the silhouette counts: ground and sky behind the wall are passed.
     """
-    row, column = np.nonzero(far)
-    some = slice(None, None, max(1, row.size // 4000))
-    row, column = row[some], column[some]
+    step = max(1, round(math.sqrt(far.size / SAMPLES)))
+    row, column = (index * step for index in np.nonzero(far[::step, ::step]))
     z = depth.depth_m[box][row, column].astype(np.float64)
     f, cx, cy = way.pinhole.f_px, way.pinhole.cx_px, way.pinhole.cy_px
     points = np.stack([(column + box[1].start - cx) / f * z, (row + box[0].start - cy) / f * z, z])
@@ -185,7 +214,7 @@ def _beyond_m(
     at = way.axes_rect.T @ (way.R_ned_rect.T @ (np.array(place.p_ned_m) - way.origin_ned_m))
     reach = (silhouette.width_m / 2 + TUNNEL_M, silhouette.height_m / 2 + TUNNEL_M)
     inside = (np.abs(right - at[0]) < reach[0]) & (np.abs(down - at[1]) < reach[1])
-    met = ahead[inside] if inside.sum() >= LEAST_PX // 4 else ahead
+    met = ahead[inside] if inside.sum() >= LEAST_PX // (4 * step * step) + 3 else ahead
     return float(np.percentile(met, 3.0) - at[2]) if met.size else 0.0
 
 
@@ -194,8 +223,13 @@ def _safest_px(hole: Mask, far: Mask, wall: Mask, band_px: int) -> FloatMap:
     kernel = np.ones((2 * band_px + 1, 2 * band_px + 1), np.uint8)
     band = cv2.dilate(hole.view(np.uint8), kernel).view(np.bool_) & wall
     chosen = band if band.sum() >= far.sum() else far
-    row, column = np.nonzero(chosen)
-    return np.array([np.median(column), np.median(row)], dtype=np.float32)
+    return np.array([_median_index(chosen.sum(axis=0)), _median_index(chosen.sum(axis=1))], dtype=np.float32)
+
+
+def _median_index(counts: NDArray[np.int64]) -> float:
+    """Return the median of indices that occur so often."""
+    total = np.cumsum(counts)
+    return float(np.searchsorted(total, total[-1] / 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,15 +242,14 @@ class _Raster:
     extent_m: tuple[float, float]
 
 
-def _raster(hole: Mask, corner: FloatMap, way: Passage, silhouette: Silhouette) -> _Raster:
+def _raster(hole: Mask, contour: FloatMap, corner: FloatMap, way: Passage, silhouette: Silhouette) -> _Raster:
     """Return how much room the silhouette has at every place of an opening.
 
     A rectangle is a rod as long as it is longer than high, thickened in the maximum norm: one erosion by the rod and
     one chessboard distance give the room at every place at once.
     """
-    row, column = np.nonzero(hole)
-    ends = np.array([[column.min(), row.min()], [column.max(), row.min()], [column.max(), row.max()],
-                     [column.min(), row.max()]], dtype=np.float64) + corner  # fmt: skip
+    (left, top), (right, bottom) = contour.min(axis=0), contour.max(axis=0)
+    ends = np.array([[left, top], [right, top], [right, bottom], [left, bottom]], dtype=np.float64)
     to_metres = np.linalg.inv(way.H_px)
     across = np.concatenate([ends, np.ones((4, 1))], axis=1) @ to_metres.T
     across = across[:, :2] / across[:, 2:]

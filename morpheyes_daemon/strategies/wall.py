@@ -144,7 +144,7 @@ def _wall_plane(inverse: FloatMap, sigma_1_m: float) -> tuple[Plane, float] | No
     plane = candidates[int(np.argmax((off < tolerance).sum(axis=0)))]
     for _ in range(ROUNDS):
         on = np.abs(A @ plane - w) < tolerance
-        plane = np.linalg.lstsq(A[on], w[on], rcond=None)[0]
+        plane = np.linalg.solve(A[on].T @ A[on], A[on].T @ w[on])
     on = np.abs(A @ plane - w) < tolerance
     return Plane(*(float(x) for x in plane)), float(np.median(w[on]))
 
