@@ -17,6 +17,7 @@ COMMANDS = (
     "calibrate",
     "analyze",
     "experiment",
+    "results",
     "doctor",
     "faults",
     "bench",

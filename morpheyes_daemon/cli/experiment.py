@@ -28,6 +28,9 @@ def command(
     world: Annotated[str | None, typer.Option(help="World by name or path, instead of the mission's own.")] = None,
     wind_m_s: Annotated[float, typer.Option(min=0.0, max=15.0, help="Mean wind, with its gusts.")] = 2.0,
     latency_ms: Annotated[float | None, typer.Option(min=0.0, help="Frame to depth in lockstep.")] = None,
+    disparities: Annotated[
+        int | None, typer.Option(min=16, max=320, help="Searched for, at 640 px; smaller images in proportion.")
+    ] = None,
     limit_s: Annotated[float, typer.Option(min=1.0, help="Simulated seconds until a flight is lost.")] = 180.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print rows and cells as JSON and nothing else.")] = False,
 ) -> None:
@@ -49,6 +52,7 @@ def command(
             world=world,
             wind_m_s=wind_m_s,
             latency_ms=latency_ms,
+            disparities=disparities,
             limit_s=limit_s,
             progress=report,
         )
@@ -61,19 +65,24 @@ def command(
             report(f"{plan.mission_name} flights", have, total)
 
         rows = run_campaign(campaign, folder, jobs, scheduler, done)
-    found, text = _tabled(plan.mission.strategy, rows)
+    found, text = _tabled(plan.mission.strategy, rows, folder)
     result = {"flights": rows, "cells": found}
     (folder / "results.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     (folder / "table.md").write_text(text + "\n", encoding="utf-8")
     typer.echo(json.dumps(result, indent=2) if as_json else f"{text}\n\n{folder}/results.json")
 
 
-def _tabled(strategy: str, rows: list[Row]) -> tuple[list[Row], str]:
-    """Return the cells of a campaign and the table that its field reports them in."""
+def _tabled(strategy: str, rows: list[Row], folder: Path) -> tuple[list[Row], str]:
+    """Return the cells of a campaign and the table that its field reports them in; figures go to `folder`."""
     if strategy == "gap":
         from morpheyes_daemon.experiments.gap_table import gap_cells, gap_table
 
         return (found := gap_cells(rows)), gap_table(found)
+    if strategy == "imo":
+        from morpheyes_daemon.experiments.imo_table import draw_trajectories, imo_cells, imo_table
+
+        draw_trajectories(rows, folder / "trajectories.png")
+        return (found := imo_cells(rows)), imo_table(found)
     from morpheyes_daemon.experiments.campaign import cells
 
     return (found := cells(rows)), table(found)

@@ -1,7 +1,8 @@
 """Many flights: every seed at every baseline, on one machine or on a Dask scheduler, resumable.
 
 Each finished flight is one line of `flights.jsonl`; a campaign started again in the same folder flies only what is
-missing. Flights are independent and indexed by seed, so the order in which they end does not matter.
+missing. Flights are independent and indexed by seed, so the order in which they end does not matter. The first seed
+of every baseline leaves log, map, strips and film.
 """
 
 from __future__ import annotations
@@ -18,11 +19,13 @@ from typing import Any
 
 from morpheyes_daemon.errors import InputError, UsageError
 from morpheyes_daemon.experiments.flight import FlightPlan, Watchers, fly
+from morpheyes_daemon.experiments.flight_outputs import FlightOutputs
 from morpheyes_daemon.experiments.measures import measures_for
 from morpheyes_daemon.experiments.plan import hold, parse_baseline, with_seed
 
 Row = dict[str, Any]
 FLIGHTS = "flights.jsonl"
+SETTINGS = "campaign.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,24 @@ class Campaign:
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
+    def settings(self) -> Row:
+        """Return what a reader of the results wants to know."""
+        plan = self.plan
+        camera, stereo = plan.config.camera, plan.config.stereo
+        return {
+            "mission": plan.mission_name,
+            "strategy": plan.mission.strategy,
+            "world": plan.scenario.world,
+            "image_size": f"{camera.width_px}x{camera.height_px}",
+            "rate_hz": camera.rate_hz,
+            "latency_ms": stereo.latency_ms,
+            "disparities_fraction": stereo.disparities_fraction,
+            "wind_m_s": plan.scenario.wind_m_s,
+            "seeds": [self.seeds[0], self.seeds[-1]],
+            "baselines": list(self.baselines),
+        }
+
+
 def parse_seeds(text: str) -> tuple[int, ...]:
     """Return the seeds of '0-39' (inclusive) or '7'; raises UsageError."""
     first, dash, last = text.partition("-")
@@ -68,12 +89,14 @@ def run_campaign(
     """
     folder.mkdir(parents=True, exist_ok=True)
     with _lock(folder):
-        rows = {(row["baseline_mode"], row["seed"]): row for row in _read(folder / FLIGHTS, campaign.key)}
+        rows_file = folder / FLIGHTS
+        rows = {(row["baseline_mode"], row["seed"]): row for row in _read(rows_file, campaign.key)}
         wanted = [(_mode(text), seed) for text in campaign.baselines for seed in campaign.seeds]
         missing = [pair for pair in wanted if pair not in rows]
         total, have = len(wanted), len(wanted) - len(missing)
-        with (folder / FLIGHTS).open("a", encoding="utf-8") as file:
-            for row in _fly_all(campaign, missing, jobs, scheduler):
+        (folder / SETTINGS).write_text(json.dumps(campaign.settings(), indent=2) + "\n", encoding="utf-8")
+        with rows_file.open("a", encoding="utf-8") as file:
+            for row in _fly_all(campaign, missing, folder, jobs, scheduler):
                 rows[row["baseline_mode"], row["seed"]] = row
                 file.write(json.dumps(row) + "\n")
                 file.flush()
@@ -99,10 +122,16 @@ def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
     return max(0.0, centre - half), min(1.0, centre + half)
 
 
-def fly_one(plan: FlightPlan, key: str) -> Row:
-    """Fly one plan and return its row; runs in a worker process."""
+def fly_one(plan: FlightPlan, key: str, folder: Path | None = None) -> Row:
+    """Fly one plan and return its row, leaving log and pictures in `folder`; runs in a worker process."""
     measures = measures_for(plan)
-    summary = fly(plan, Watchers(attach=[measures.attach] if measures else []))
+    watchers = Watchers(attach=[measures.attach] if measures else [])
+    outputs = FlightOutputs(folder, plan) if folder else None
+    if outputs:
+        outputs.watch(watchers)
+    summary = fly(plan, watchers)
+    if outputs:
+        outputs.finish(summary)
     return {**summary.as_json(), **(measures.row() if measures else {}), "campaign": key}
 
 
@@ -164,11 +193,18 @@ def _plan(campaign: Campaign, mode: str, seed: int) -> FlightPlan:
 
 
 def _fly_all(
-    campaign: Campaign, pairs: Sequence[tuple[str, int]], jobs: int, scheduler: str | None
+    campaign: Campaign, pairs: Sequence[tuple[str, int]], folder: Path, jobs: int, scheduler: str | None
 ) -> Iterator[Row]:
+    """Fly; the first seed of every baseline leaves its pictures, when this machine does the flying."""
     import joblib
 
-    calls = [joblib.delayed(fly_one)(_plan(campaign, mode, seed), campaign.key) for mode, seed in pairs]
+    def pictures(mode: str, seed: int) -> Path | None:
+        return folder / f"{mode}-{seed}" if seed == campaign.seeds[0] and scheduler is None else None
+
+    calls = [
+        joblib.delayed(fly_one)(_plan(campaign, mode, seed), campaign.key, pictures(mode, seed))
+        for mode, seed in pairs
+    ]
     if not calls:
         return
     with _backend(scheduler):

@@ -15,6 +15,9 @@ from morpheyes_daemon.shipped import find_mission, load_config, load_mission
 from morpheyes_daemon.simulation.worlds import load_world
 from morpheyes_daemon.stereo.rig import RigModel
 
+DISPARITIES_OF_PX = 640
+"""Width of the images that a number of disparities is said for; smaller images search in proportion."""
+
 
 def make_plan(
     mission: str,
@@ -28,6 +31,7 @@ def make_plan(
     world: str | None = None,
     wind_m_s: float = 2.0,
     latency_ms: float | None = None,
+    disparities: int | None = None,
     limit_s: float = 180.0,
     threads: int = 1,
     progress: Progress = silent,
@@ -36,9 +40,12 @@ def make_plan(
     file = load_mission(mission)
     vehicle = sim_config(load_config(config), rate_hz, parse_size(size), None)
     vehicle = hold(vehicle, parse_baseline(baseline))
+    stereo: dict[str, float] = {}
     if latency_ms is not None:
-        stereo = vehicle.stereo.model_copy(update={"latency_ms": latency_ms})
-        vehicle = vehicle.model_copy(update={"stereo": stereo})
+        stereo["latency_ms"] = latency_ms
+    if disparities is not None:
+        stereo["disparities_fraction"] = disparities / DISPARITIES_OF_PX
+    vehicle = vehicle.model_copy(update={"stereo": vehicle.stereo.model_copy(update=stereo)})
     place = world or file.world
     load_world(place)
     path = calibration_file(calibration, progress)

@@ -35,7 +35,8 @@ class Texture:
         value[..., :3] *= value[..., :3]
         chain = [_blocks(self.texels)]
         while value.shape[0] > BLOCK:
-            value = cv2.resize(value, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            halved = cv2.resize(value, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            value = np.asarray(halved, dtype=np.float32)
             encoded = value.copy()
             encoded[..., :3] = np.sqrt(encoded[..., :3])
             chain.append(_blocks(np.rint(encoded).astype(np.uint8)))

@@ -1,0 +1,18 @@
+"""`morpheyes results`: the tables of campaigns as one page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def command(
+    folders: Annotated[list[Path], typer.Argument(help="Folders of finished `morpheyes experiment` campaigns.")],
+    out: Annotated[Path, typer.Option(help="Page to write; its other parts are kept.")] = Path("docs/results.md"),
+) -> None:
+    """Write the missions' part of a results page from campaigns: what the paper says, what came out, why."""
+    from morpheyes_daemon.experiments.results_page import write_page
+
+    typer.echo(write_page(folders, out))

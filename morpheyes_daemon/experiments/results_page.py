@@ -1,0 +1,114 @@
+"""The missions' part of docs/results.md, made from campaign folders: what the paper says, what came out, why.
+
+Nothing here flies; it reads what `morpheyes experiment` left behind. The rest of the page is kept as it is.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.experiments.campaign import SETTINGS, Row
+
+BEGIN = "<!-- missions: written by `morpheyes results` -->"
+END = "<!-- end of missions -->"
+
+TITLES = {"forest": "Forest", "gap": "Gap", "imo": "Moving object"}
+
+PAPER = {
+    "forest": (
+        "The paper flew a forest once per baseline, at 1 Hz: the large fixed baseline crashed, the small one was four "
+        "times slower, the variable one came through. Peers fly up to 3 m/s at over 400 trees per hectare with VI-SLAM "
+        "and maps."
+    ),
+    "gap": (
+        "The paper shows one crossing of each shape and of a moving gap. Peers report 85 % at 2.5 m/s with 50 mm to "
+        "spare, and 3 m/s with 40 mm."
+    ),
+    "imo": "The paper shows one trajectory; each fixed baseline loses the object somewhere along its range.",
+}
+"""What there is to compare with."""
+
+WHY = {
+    "forest": (
+        "Differences: our fixed baselines run under the same speed governor as the variable one, so a baseline that "
+        "sees badly makes the vehicle slow or stop, not crash; the paper held the speed and counted crashes."
+    ),
+    "gap": "Success counts a crossing in which neither hull, bar nor propellers touch; touching by any of them fails.",
+    "imo": (
+        "A detection counts only where this frame's own measurement lies within max(0.3 m, 5 %) of the visible face; "
+        "predictions of the filter do not."
+    ),
+}
+
+
+def write_page(folders: Sequence[Path], page: Path) -> str:
+    """Replace the missions' part of `page` by what the campaigns in `folders` found; return that part.
+
+    Raises InputError naming a folder that holds no finished campaign.
+    """
+    part = missions_part([_read(folder) for folder in folders])
+    text = page.read_text(encoding="utf-8") if page.is_file() else "# Results\n"
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text(_with_part(text, part), encoding="utf-8")
+    return part
+
+
+def missions_part(found: Sequence[tuple[Row, str]]) -> str:
+    """Return Markdown for (settings, table) of every campaign, mission by mission in the order given."""
+    blocks = []
+    for strategy in dict.fromkeys(settings["strategy"] for settings, _ in found):
+        blocks.append(f"## {TITLES.get(strategy, strategy)}")
+        if strategy in PAPER:
+            blocks.append(PAPER[strategy])
+        for settings, table in found:
+            if settings["strategy"] == strategy:
+                blocks += [f"{_conditions(settings)}\n`{_command(settings)}`", table.strip()]
+        if strategy in WHY:
+            blocks.append(WHY[strategy])
+    return "\n\n".join(blocks)
+
+
+def _conditions(settings: Row) -> str:
+    return (
+        f"World `{settings['world']}`, {settings['image_size']}, {settings['rate_hz']:g} Hz with "
+        f"{settings['latency_ms']:g} ms of latency, {settings['disparities_fraction'] * 640:.0f} disparities at 640 px, "
+        f"wind {settings['wind_m_s']:g} m/s:"
+    )
+
+
+def _command(settings: Row) -> str:
+    low, high = settings["seeds"]
+    options = [f"--seeds {low}-{high}", f"--size {settings['image_size']}"]
+    if settings["baselines"] != ["variable"]:
+        options.append(f"--baselines {','.join(settings['baselines'])}")
+    usual: dict[str, Any] = {"rate_hz": 5.0, "latency_ms": 100.0, "wind_m_s": 2.0}
+    options += [f"--{key.replace('_', '-')} {settings[key]:g}" for key, value in usual.items() if settings[key] != value]
+    if round(settings["disparities_fraction"] * 640) != USUAL_DISPARITIES:
+        options.append(f"--disparities {settings['disparities_fraction'] * 640:.0f}")
+    return " ".join([f"morpheyes experiment {settings['mission']}", *options, f"--world {settings['world']}"])
+
+
+USUAL_DISPARITIES = 160
+
+
+def _read(folder: Path) -> tuple[Row, str]:
+    try:
+        settings = json.loads((folder / SETTINGS).read_text(encoding="utf-8"))
+        return settings, (folder / "table.md").read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        name = Path(str(error.filename)).name
+        raise InputError(f"{folder}: has no {name}; is it the --out of a finished `morpheyes experiment`?") from None
+    except (OSError, json.JSONDecodeError) as error:
+        raise InputError(f"{folder}: cannot be read ({error}).") from None
+
+
+def _with_part(text: str, part: str) -> str:
+    block = f"{BEGIN}\n\n{part}\n\n{END}"
+    if BEGIN in text and END in text:
+        before, _, rest = text.partition(BEGIN)
+        return before + block + rest.partition(END)[2]
+    return f"{text.rstrip()}\n\n{block}\n"
