@@ -129,7 +129,8 @@ class Perception:
 
     `percept` is the strategy's own (picklable) finding. `sectors_m` (72,) float32 nearest obstacle per sector of
     the horizontal field of view, left to right, NaN free or unknown, for OBSTACLE_DISTANCE.
-    `left_rect` and `depth_m` are small views for recorder and dashboard, or None when not asked for.
+    `left_rect` and `depth_m` are small views for recorder and dashboard, or None when not asked for. `events` is what
+    the watch over the calibration has to tell.
     """
 
     summary: DepthSummary
@@ -138,6 +139,7 @@ class Perception:
     image_faults: tuple[Reason, ...] = ()
     left_rect: Image | None = None
     depth_m: FloatMap | None = None
+    events: tuple[Event, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,13 +12,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morpheyes_daemon.calibration.ego_motion import eye_motion
+from morpheyes_daemon.calibration.drift import Drift, DriftLimits, DriftMonitor
+from morpheyes_daemon.calibration.ego_motion import EyeMotion, eye_motion
 from morpheyes_daemon.calibration.scale_watch import ScaleWatch, Sight
 from morpheyes_daemon.clock import stopwatch_s
 from morpheyes_daemon.config import MissionFile, VehicleConfig
 from morpheyes_daemon.messages import (
     DepthMap,
     DepthSummary,
+    Event,
     FloatMap,
     Image,
     Perception,
@@ -28,6 +30,7 @@ from morpheyes_daemon.messages import (
 )
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.stereo.depth import DepthEstimator, RectifiedPair, disparity_of
+from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
 from morpheyes_daemon.stereo.image_checks import AlikeCheck, FrozenCheck, ImageFault, exposure_faults, matching_faults
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import Craft, Strategy, View
@@ -91,6 +94,7 @@ class Pipeline:
     def __init__(self, config: VehicleConfig, mission: MissionFile, rig: RigModel) -> None:
         self._estimator = DepthEstimator(rig, config.stereo, (config.camera.width_px, config.camera.height_px))
         self._frozen, self._alike, self._scale = FrozenCheck(), AlikeCheck(), ScaleWatch()
+        self._drift = DriftMonitor(self._estimator.rig, DriftLimits(late_s=config.camera.sync_error_ms / 1e3))
         self._strategy = build_strategy(mission, config)
         self._T_frd_rig = build_craft(config).T_frd_rig
 
@@ -99,7 +103,10 @@ class Pipeline:
         started_s = stopwatch_s()
         pair = self._estimator.rectified(job.frame)
         depth = self._estimator.depth(job.frame, pair)
-        faults = self._image_faults(job, pair, depth)
+        motion = eye_motion(job.vehicle, self._T_frd_rig, depth.T_rig_rect)
+        offsets = row_offsets(pair.left, pair.right, disparity_of(depth))
+        events = self._watch_calibration(job.frame, pair, depth, offsets, motion)
+        faults = self._image_faults(job.frame, pair, depth, offsets, motion)
         view = View(depth, pair.left, pair.right, job.vehicle, self._T_frd_rig)
         percept = self._strategy.perceive(view)
         return Perception(
@@ -109,17 +116,38 @@ class Pipeline:
             image_faults=faults,
             left_rect=_small(job.frame.left) if job.keep_images else None,
             depth_m=frozen(depth.depth_m[::2, ::2].copy()) if job.keep_images else None,
+            events=events,
         )
 
-    def _image_faults(self, job: VisionJob, pair: RectifiedPair, depth: DepthMap) -> tuple[Reason, ...]:
+    def _watch_calibration(
+        self, frame: StereoFrame, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, motion: EyeMotion
+    ) -> tuple[Event, ...]:
+        """Return what the drift watch noticed; the next frame is rectified by what it corrected."""
+        seen = self._drift.update(pair, depth, offsets, frame.baseline.moving, motion)
+        if seen.rig_changed:
+            self._estimator = self._estimator.turned(self._drift.rig)
+        return tuple(
+            Event(
+                frame.t_ns,
+                "calibration",
+                Reason.EYES_LATE if finding.what is Drift.LATE else Reason.CALIBRATION_DRIFT,
+                finding.text,
+            )
+            for finding in seen.findings
+        )
+
+    def _image_faults(
+        self, frame: StereoFrame, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, motion: EyeMotion
+    ) -> tuple[Reason, ...]:
         """Return why the frame must not be flown on, empty when it may."""
         found = exposure_faults(pair.left, pair.right)
         found |= matching_faults(pair.left, pair.right, depth.valid_fraction)
-        found |= self._alike.check(pair.left, pair.right, disparity_of(depth), depth.pinhole.f_px)
-        if self._frozen.check(job.frame.left, job.frame.right):
+        found |= self._alike.check(pair.left, offsets, depth.pinhole.f_px)
+        if self._frozen.check(frame.left, frame.right):
             found.add(ImageFault.FROZEN)
         reasons = {_REASONS.get(fault, Reason.IMAGE_BAD) for fault in found}
-        motion = eye_motion(job.vehicle, self._T_frd_rig, depth.T_rig_rect)
+        if self._drift.broken:
+            reasons.add(Reason.EYES_APART)
         if self._scale.check(Sight(pair.left, depth, motion)):
             reasons.add(Reason.DEPTH_SCALE)
         return tuple(sorted(reasons, key=lambda reason: reason.number))

@@ -110,7 +110,8 @@ class RigCheck:
         """Look at one raw pair; raises InputError or CalibrationError when it does not fit the calibration."""
         here = self._checks.setdefault(nominal_m, BaselineCheck(nominal_m))
         here.pairs += 1
-        frame = StereoFrame(0, self._time_ns, left, right, BaselineEstimate(0, nominal_m, nominal_m, _SERVO_SIGMA_M, False))
+        baseline = BaselineEstimate(0, nominal_m, nominal_m, _SERVO_SIGMA_M, False)
+        frame = StereoFrame(0, self._time_ns, left, right, baseline)
         pair = self._estimator.rectified(frame)
         depth = self._estimator.depth(frame, pair)
         disparity = disparity_of(depth)

@@ -114,6 +114,8 @@ class DriftMonitor:
         self._told: set[Drift] = set()
         self._fit: RowFit | None = None
         self._agreeing = 0
+        self.broken = False
+        """An eye has turned farther than any drift: depth is worth nothing until a new calibration."""
         self._rows, self._yaw = RowWatch(_MEMORY, self.limits.late_s), YawWatch(uncertain)
 
     def update(
@@ -173,7 +175,7 @@ class DriftMonitor:
             return self._once(Drift.ROWS, f"rows differ by {median_px:.2f} px: watching whether an eye has turned")
         turn = np.array([fit.pitch_rad if sure[0] else 0.0, 0.0, fit.roll_rad if sure[1] else 0.0])
         text = f"the right eye has turned by {math.degrees(turn[0]):+.3f} deg in pitch and "
-        return [self._turn(Drift.TURNED, turn, nominal_m, f"{text}{math.degrees(turn[2]):+.3f} deg in roll")]
+        return self._turn(Drift.TURNED, turn, nominal_m, f"{text}{math.degrees(turn[2]):+.3f} deg in roll")
 
     def _unexplained(self, fit: RowFit, median_px: float) -> list[DriftFinding]:
         """Rows that differ though no turn and no time offset explains it."""
@@ -188,7 +190,7 @@ class DriftMonitor:
         if not abs(yaw) * f_px >= limits.yaw_px or abs(yaw) < needed * sigma:
             return []
         text = f"the right eye has turned by {math.degrees(yaw):+.3f} deg in yaw ({yaw * f_px:+.2f} px of disparity)"
-        return [self._turn(Drift.YAW, np.array([0.0, yaw, 0.0]), nominal_m, text)]
+        return self._turn(Drift.YAW, np.array([0.0, yaw, 0.0]), nominal_m, text)
 
     def _judge_late(self) -> list[DriftFinding]:
         fit, limits = self._fit, self.limits
@@ -200,16 +202,16 @@ class DriftMonitor:
         text = f"the right eye exposes {fit.late_s * 1e3:.1f} ms late, not {limits.late_s * 1e3:.1f} ms as declared"
         return self._once(Drift.LATE, text)
 
-    def _turn(self, what: Drift, turn_rect_rad: Array, nominal_m: float, text: str) -> DriftFinding:
+    def _turn(self, what: Drift, turn_rect_rad: Array, nominal_m: float, text: str) -> list[DriftFinding]:
         """Turn the rig's right eye, unless it has turned so far in all that it must be broken."""
         turned = turned_rig(self.rig, turn_rect_rad, nominal_m)
         total = turn_between(self.rig, nominal_m, R_from_rotvec(turn_rect_rad)) @ self._turned
         angle = math.acos(max(-1.0, min(1.0, (float(np.trace(total)) - 1.0) / 2.0)))
         if angle > self.limits.largest_rad:
-            self._agreeing = 0
-            return DriftFinding(Drift.BROKEN, False, f"{text}: too far for a drift; land and calibrate again")
+            self._agreeing, self.broken = 0, True
+            return self._once(Drift.BROKEN, f"{text}: too far for a drift; land and calibrate again")
         self.rig, self._turned = turned, total
-        return DriftFinding(what, True, f"{text}; corrected")
+        return [DriftFinding(what, True, f"{text}; corrected")]
 
     def _once(self, what: Drift, text: str) -> list[DriftFinding]:
         if what in self._told:

@@ -267,7 +267,8 @@ def _solve(
             -predicted * x[:, 1],
         ]
     )
-    prior = np.array([math.inf, ratio_sigma(first, second), uncertain.translation_m, uncertain.turn_rad, uncertain.turn_rad])
+    turn = uncertain.turn_rad
+    prior = np.array([math.inf, ratio_sigma(first, second), uncertain.translation_m, turn, turn])
     noise = _NOISE_PX * np.sqrt(1.0 + slope**2)
     error = d_2 - predicted
     solution, covariance, kept = _robust(columns / noise[:, None], error / noise, 1.0 / prior)

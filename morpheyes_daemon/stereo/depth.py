@@ -49,6 +49,10 @@ class DepthEstimator:
         self.config = config or StereoConfig()
         self.settings = settings or default_settings(self.rig.size[1])
 
+    def turned(self, rig: RigModel) -> DepthEstimator:
+        """Return an estimator for the same rig with an eye turned, at the size of the images."""
+        return DepthEstimator(rig, self.config, settings=self.settings)
+
     @property
     def rig(self) -> RigModel:
         """The rig at the size of the images."""

@@ -13,8 +13,8 @@ from enum import StrEnum
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages import FloatMap, Image
-from morpheyes_daemon.stereo.epipolar import MIN_POINTS, RowFit, RowOffsets, row_offsets
+from morpheyes_daemon.messages import Image
+from morpheyes_daemon.stereo.epipolar import MIN_POINTS, RowOffsets
 from morpheyes_daemon.stereo.matching import MatchSettings, semi_global
 
 
@@ -35,7 +35,6 @@ class ImageFault(StrEnum):
     BLANK = "blank", "an eye shows one even grey"
     SWAPPED = "swapped", "the left and the right eye are swapped"
     MISALIGNED = "misaligned", "the rows of the eyes do not align: bent rig or wrong calibration"
-    DESYNCHRONIZED = "desynchronized", "the eyes do not expose at the same time"
     UNLIKE = "unlike", "the eyes do not see the same scene"
     APART = "apart", "the rows of the eyes stay apart: not exposed together, bent, or another rig's calibration"
 
@@ -55,9 +54,6 @@ class ImageLimits:
     suspicious_valid_fraction: float = 0.45
     better_gain: float = 2.0
     better_share: float = 0.35
-    misaligned_px: float = 1.5
-    misaligned_points: int = 60
-    late_sigmas: float = 5.0
     alike_share: float = 0.3
     textured_share: float = 0.3
     textured_levels: float = 5.0
@@ -95,10 +91,9 @@ class AlikeCheck:
         self._unlike: deque[bool] = deque(maxlen=self._limits.unlike_of)
         self._apart: deque[bool] = deque(maxlen=self._limits.apart_of)
 
-    def check(self, left: Image, right: Image, disparity_px: FloatMap, f_px: float) -> set[ImageFault]:
-        """Look at a rectified grey pair (H, W) with its disparity (H, W), NaN unknown, and focal length."""
+    def check(self, left: Image, found: RowOffsets, f_px: float) -> set[ImageFault]:
+        """Look at a rectified grey left image (H, W), what was found of it in the right one, and focal length."""
         limits = self._limits
-        found = row_offsets(left, right, disparity_px)
         unlike = found.tried >= limits.alike_points and found.count < limits.alike_share * found.tried
         unlike = unlike and _textured_share(left, limits.textured_levels) > limits.textured_share
         self._unlike.append(unlike)
@@ -167,22 +162,6 @@ def _matched_share(left: Image, right: Image) -> float:
     settings = MatchSettings()
     disparity = semi_global(left, right, 0, 48, settings, settings.coarse_speckle_px)
     return float(np.mean(disparity >= 1.0))
-
-
-def row_faults(
-    offsets: RowOffsets, fit: RowFit, declared_late_s: float, limits: ImageLimits | None = None
-) -> set[ImageFault]:
-    """Return what the row offsets of a frame and their explanation (`epipolar.RowWatch`) say against the pair.
-
-    `declared_late_s` bounds the time between the eyes that is known and accounted for.
-    """
-    limits = limits or ImageLimits()
-    faults = set()
-    if abs(fit.late_s) - limits.late_sigmas * fit.late_sigma_s > declared_late_s:
-        faults.add(ImageFault.DESYNCHRONIZED)
-    elif offsets.count >= limits.misaligned_points and offsets.median_px > limits.misaligned_px:
-        faults.add(ImageFault.MISALIGNED)
-    return faults
 
 
 def _textured_share(image: Image, levels: float) -> float:

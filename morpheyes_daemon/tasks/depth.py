@@ -38,7 +38,7 @@ async def depth(
 ) -> None:
     """Have every newest frame looked at; bad images renew no lease, so they end in neutral sticks.
 
-    Rows that drift apart are reported only: correcting them is the drift watch's, and small images tell them badly.
+    Rows that drift are reported only: correcting them is the pipeline's, and what it did comes as its events.
     """
     frames = topics.frame.reader()
     next_image_ns = 0
@@ -52,6 +52,8 @@ async def depth(
         for reason in (reason for reason in seen.image_faults if reason not in faults):
             events.publish(Event(clock.now_ns(), "depth", reason, reason.text))
         faults = seen.image_faults
+        for event in seen.events:
+            events.publish(event)
         if not WORTHLESS & set(faults):
             gate.renew(Lease.DEPTH, frame.t_ns + lease_ns)
         topics.perception.publish(seen)
