@@ -36,6 +36,7 @@ from morpheyes_daemon.safety.guardian import Guardian, GuardianLimits
 from morpheyes_daemon.safety.states import Action, State, Transition
 from morpheyes_daemon.supervisor.supervisor import Supervisor, Task
 from morpheyes_daemon.supervisor.worker import VisionWorker
+from morpheyes_daemon.tasks.avoidance import avoidance
 from morpheyes_daemon.tasks.baseline import baseline
 from morpheyes_daemon.tasks.capture import capture
 from morpheyes_daemon.tasks.depth import depth
@@ -88,6 +89,7 @@ class Daemon:
         self._parts = parts
         self._clock = parts.clock
         self._strategy = build_strategy(mission_file, config)
+        self._avoids = mission_file.avoidance
         self.hub = AutopilotHub(config.autopilot, parts.clock, topics, events, parts.opener)
         self._send = self.hub.claim_stick_output()
         self.gate = Gate(self._output)
@@ -192,6 +194,15 @@ class Daemon:
                 essential=False,
             ),
         ]
+        if not self._avoids:
+            table.append(
+                Task(
+                    "avoidance",
+                    lambda pulse: avoidance(self.hub, guardian, clock, pulse),
+                    Reason.TASK_DIED,
+                    essential=False,
+                )
+            )
         if config.autopilot.publish_obstacles:
             table.append(
                 Task(

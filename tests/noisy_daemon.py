@@ -81,13 +81,13 @@ class NoisyDaemon:
     link is answered by nobody. With a `NoServoConfig` it stands by, ready to fly.
     """
 
-    def __init__(self, servo_config: ServoConfig) -> None:
+    def __init__(self, servo_config: ServoConfig, mission: MissionFile | None = None) -> None:
         clock = running_clock()
         config = VehicleConfig(
             camera=SimCameraConfig(), servo=servo_config, autopilot=AutopilotConfig(url="memory:autopilot")
         )
         self.clock = clock
-        self._twin = AutopilotTwin(Vehicle(), clock)
+        self.twin = AutopilotTwin(Vehicle(), clock)
         self.states: Counter[State] = Counter()
         self.links: dict[str, HeldLink] = {}
         topics, log = Topics.create(), EventLog()
@@ -96,11 +96,11 @@ class NoisyDaemon:
         servo = build_servo(config.servo, self._open, clock, log)
         worker: InlineWorker[Any, Any] = InlineWorker(lambda job: job, 0, clock)
         parts = Parts(clock=clock, camera=Blind(), servo=servo, opener=self._open, worker=worker)
-        self.daemon = Daemon(config, MissionFile(strategy="forest"), parts, topics, log)
+        self.daemon = Daemon(config, mission or MissionFile(strategy="forest"), parts, topics, log)
         self._stop = asyncio.Event()
 
     async def __aenter__(self) -> Self:
-        self._lives = [asyncio.create_task(self.daemon.run(self._stop)), asyncio.create_task(self._twin.run())]
+        self._lives = [asyncio.create_task(self.daemon.run(self._stop)), asyncio.create_task(self.twin.run())]
         await self.pass_time(5.0)
         for _ in range(20):
             await self.pass_time(0.1)
@@ -117,7 +117,7 @@ class NoisyDaemon:
         name = url.partition(":")[2]
         self.links[name] = link = HeldLink(on_bytes, on_lost)
         if name == "autopilot":
-            link.receive = self._twin.attach(_BackChannel(link))
+            link.receive = self.twin.attach(_BackChannel(link))
         return link
 
     async def pass_time(self, seconds: float) -> None:
