@@ -15,6 +15,9 @@ Vector3 = tuple[float, float, float]
 CLIMB_MOST_M_S = 0.5
 """As the velocity loop's own bound on climbing."""
 
+LEAN_LAG_S = 0.15
+"""A wanted velocity takes hold so much later (VelocityTuning.lean_lag_s)."""
+
 AHEAD_MOST_S = 2.0
 """A moving line is not carried on for longer than this."""
 
@@ -40,7 +43,7 @@ def wanted_velocity(command: MissionCommand, vehicle: VehicleState, now_ns: int)
 
 
 def _line_at(line: Line, now_ns: int) -> tuple[Vector3, Vector3]:
-    """Return where the line's point is and how it moves."""
+    """Return where the line's point is, and how it moves when the lean takes hold."""
     t = max(0.0, min(AHEAD_MOST_S, (now_ns - line.t_ns) / S))
     p, v, a = line.p_ned_m, line.v_ned_m_s, line.a_ned_m_s2
     place = (
@@ -48,4 +51,5 @@ def _line_at(line: Line, now_ns: int) -> tuple[Vector3, Vector3]:
         p[1] + (v[1] + 0.5 * a[1] * t) * t,
         p[2] + (v[2] + 0.5 * a[2] * t) * t,
     )
+    t += LEAN_LAG_S
     return place, (v[0] + a[0] * t, v[1] + a[1] * t, v[2] + a[2] * t)

@@ -124,9 +124,10 @@ def focus_of_expansion(flow: FloatMap) -> tuple[float, float]:
 
 def largest_hole(inverse: FloatMap) -> tuple[Mask, float, bool]:
     """Return the largest hole (H, W) that the near surface encloses, Ashman's D of the split, and whether it is one."""
-    smooth = cv2.medianBlur(inverse, 5)
+    smooth: FloatMap = np.asarray(cv2.medianBlur(inverse, 5), dtype=np.float32)
     for _ in range(2):
-        smooth = cv2.bilateralFilter(smooth, SMOOTH_PX, 0.3 * float(np.median(smooth)), SMOOTH_PX)
+        filtered = cv2.bilateralFilter(smooth, SMOOTH_PX, 0.3 * float(np.median(smooth)), SMOOTH_PX)
+        smooth = np.asarray(filtered, dtype=np.float32)
     found = split_inverse(smooth, np.zeros(smooth.shape, np.bool_), FLOW_SIGMA * float(np.median(np.abs(smooth))))
     if found is None:
         return np.zeros(smooth.shape, np.bool_), 0.0, False

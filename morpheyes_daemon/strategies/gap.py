@@ -32,7 +32,7 @@ class GapParameters(StrategyParameters):
 
     speed_m_s: float = Field(3.0, gt=0.2, le=6, description="through the opening; the governor is the real bound")
     approach_m_s: float = Field(1.2, gt=0.1, le=3, description="to the stand-off")
-    stand_off_m: float = Field(3.4, gt=1.5, le=10, description="from here it measures, and takes its run")
+    stand_off_m: float = Field(4.0, gt=1.5, le=10, description="from here it measures, and takes its run")
     margin_m: float = Field(0.0, ge=0, le=0.5, description="measured room around the silhouette that it must have")
     lean_deg: float = Field(12.0, ge=0, le=30, description="of the vehicle when crossing, for its silhouette")
     baseline_gain: float = Field(0.05, gt=0, le=1, description="K of b = K median(Z_C)")
@@ -72,8 +72,8 @@ class GapPercept:
     openings: tuple[Opening, ...]
 
 
-RANGE_SIGMA: Array = np.array([0.006, 0.006, 0.012])
-"""One sigma of where an opening is seen (ned), per metre of range: a pixel and the attitude, which pitches most."""
+RANGE_SIGMA: Array = np.array([0.006, 0.006, 0.010])
+"""One sigma of where an opening is seen along, across and down, per metre of range: a pixel, and the attitude."""
 
 YAW_SIGMA: Array = np.full(3, 0.02)
 """One sigma of a wall's heading, radians."""
@@ -93,11 +93,17 @@ STAND_M = 0.35
 TURNED_RAD = math.radians(3.0)
 SETTLED_M = 0.004
 
-HOLD_1_S, RUN_1_S = 0.6, 2.0
+SLOW_M_S, TURNS_RAD = 0.2, math.radians(9.0)
+"""A moving opening is crossed where it turns back, and while the wall stands across the way."""
+
+GATHER_S = 0.75
+"""What gathering speed costs in time."""
+
+HOLD_1_S, RUN_1_S = 0.6, 2.5
 """Gains on what is missing to the line; gentle before the wall, since a vehicle that brakes looks up."""
 
-MOVES_M = 0.12
-"""A place that wanders by more within some seconds moves; the autopilot's drift is 0.05 m."""
+MOVES_M = 0.2
+"""A place that wanders across by more within some seconds moves; the autopilot's drift is 0.05 m."""
 
 NOSE_M = 0.3
 """From the autopilot to the foremost point, with some room."""
@@ -171,8 +177,8 @@ class Gap(Strategy):
     def _settle(self, observation: Observation) -> None:
         """Before the mission engages: forget what the climb showed."""
         self._phase = Phase.APPROACH
-        self._track, self._yaw, self._room, self._chosen = PointTrack(), PointTrack(), [], None
         self._yaw_rad = observation.vehicle.yaw_rad
+        self._track, self._yaw, self._room, self._chosen = PointTrack(self._yaw_rad), PointTrack(), [], None
         self._settled_ns = self._seen_ns = observation.now_ns
 
     def _take_in(self, percept: GapPercept, observation: Observation) -> None:
@@ -197,14 +203,14 @@ class Gap(Strategy):
         measures = self._phase is Phase.APPROACH and opening.z_m < 1.2 * self.parameters.stand_off_m
         if measures and percept.scale_sigma < SURE_SCALE:
             self._room = [*self._room[-30:], place.clearance_m]
-        if self._track.spread_m(3.0) > MOVES_M:
+        if self._phase in (Phase.APPROACH, Phase.CLOSE) and self._track.spread_m(3.0) > MOVES_M:
             self._track.moves = self._yaw.moves = True
 
     def _scaled(self, p_ned_m: Array, percept: GapPercept) -> Array:
         """Return where the opening was seen; with the eyes under way only the direction, at the range known before."""
         if percept.scale_sigma < SURE_SCALE or not self._track.count:
             return p_ned_m
-        ahead, origin = self._ahead(percept.t_ns), np.array(percept.origin_ned_m)
+        ahead, origin = self._ahead(), np.array(percept.origin_ned_m)
         known = float((self._track.at(percept.t_ns).p_m - origin) @ ahead)
         return np.asarray(origin + (p_ned_m - origin) * known / max(0.1, float((p_ned_m - origin) @ ahead)))
 
@@ -234,7 +240,7 @@ class Gap(Strategy):
                 why = "no opening in the wall" if percept.bimodal else "the depth has no two clusters"
                 return self._command(observation, Intent.REFUSE, Reason.MISSION_REFUSED, text=why)
             return self._command(observation, Intent.STOP, Reason.NO_FREE_PATH)
-        opening, ahead = self._track.at(now_ns), self._ahead(now_ns)
+        opening, ahead = self._track.at(now_ns), self._ahead()
         range_m = float((opening.p_m - np.array(vehicle.p_ned_m)) @ ahead)
         start = opening.p_m - parameters.stand_off_m * ahead
         if observation.engaged and self._stands(observation, start, ahead):
@@ -256,9 +262,18 @@ class Gap(Strategy):
             self.parameters.approach_m_s,
         )  # fmt: skip
         return self._command(
-            observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(observation.now_ns),
-            clear_m=max(0.0, range_m - NOSE_M), z_m=range_m,
+            observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(),
+            clear_m=self._clear_m(observation, range_m), z_m=range_m,
         )  # fmt: skip
+
+    def _clear_m(self, observation: Observation, range_m: float) -> float:
+        """How far it may go before the wall: by the track, or by what this frame shows, if that is less."""
+        percept: GapPercept = observation.percept
+        seen_m = range_m
+        if math.isfinite(percept.range_m):
+            wall = np.array(percept.origin_ned_m) + percept.range_m * self._ahead()
+            seen_m = float((wall - np.array(observation.vehicle.p_ned_m)) @ self._ahead())
+        return max(0.0, min(range_m, seen_m) - NOSE_M)
 
     def _stands(self, observation: Observation, start: Array, ahead: Array) -> bool:
         """Tell whether it stands at the stand-off, set on the opening as it was seen a moment ago."""
@@ -266,7 +281,7 @@ class Gap(Strategy):
         off = start - np.array(vehicle.p_ned_m)
         along_m = float(off @ ahead)
         across_m = float(np.linalg.norm(off - along_m * ahead))
-        turned = abs(wrap_rad(self._heading_rad(observation.now_ns) - vehicle.yaw_rad))
+        turned = abs(wrap_rad(self._heading_rad() - vehicle.yaw_rad))
         wide = 2.5 if self._track.moves else 1.0
         return (
             abs(along_m) < STAND_M
@@ -291,7 +306,19 @@ class Gap(Strategy):
         """A standing opening at once; a moving one after it was watched, when it will be slow at the crossing."""
         if not self._track.moves:
             return True
-        return observation.now_ns - self._settled_ns > self.parameters.watch_s * S
+        now_ns = observation.now_ns
+        watched_s = (now_ns - self._settled_ns) / S
+        if watched_s < self.parameters.watch_s:
+            return False
+        crossing_ns = now_ns + round(self._run_s() * S)
+        fast = float(np.linalg.norm(self._track.at(crossing_ns).v_m_s))
+        turned = abs(float(self._yaw.at(crossing_ns).p_m[1] - self._yaw.middle[1]))
+        patience = 1.0 + max(0.0, watched_s - 2 * self.parameters.watch_s) / self.parameters.watch_s
+        return fast < patience * SLOW_M_S and turned < patience * TURNS_RAD
+
+    def _run_s(self) -> float:
+        """Time from the stand-off to the wall: the set speed, reached with about the lean that Loiter gives it."""
+        return self.parameters.stand_off_m / self.parameters.speed_m_s + GATHER_S
 
     def _refuse(self, observation: Observation) -> MissionCommand:
         need, chosen = self.silhouette, self._chosen
@@ -307,7 +334,7 @@ class Gap(Strategy):
     def _run(self, observation: Observation) -> MissionCommand:
         """Through the opening; broken off while it can still stop before the wall and the opening is lost."""
         parameters, vehicle, now_ns = self.parameters, observation.vehicle, observation.now_ns
-        opening, ahead = self._track.at(now_ns), self._ahead(now_ns)
+        opening, ahead = self._track.at(now_ns), self._ahead()
         range_m = float((opening.p_m - np.array(vehicle.p_ned_m)) @ ahead)
         if range_m < -parameters.behind_m:
             self._phase = Phase.BEHIND
@@ -321,7 +348,7 @@ class Gap(Strategy):
         v = parameters.speed_m_s * ahead
         line = Line(now_ns, _three(opening.p_m), _three(opening.v_m_s), _three(opening.a_m_s2), RUN_1_S, 1.0)
         return self._command(
-            observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(now_ns), v_ned_m_s=_three(v),
+            observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(), v_ned_m_s=_three(v),
             clear_m=max(0.0, beyond_m - NOSE_M), z_m=beyond_m, contour_m=range_m,
         )  # fmt: skip
 
@@ -332,15 +359,13 @@ class Gap(Strategy):
             return self._command(observation, Intent.DONE, Reason.GOAL_REACHED)
         return self._command(observation, Intent.STOP, None)
 
-    def _ahead(self, t_ns: int) -> Array:
-        yaw_rad = self._heading_rad(t_ns)
+    def _ahead(self) -> Array:
+        yaw_rad = self._heading_rad()
         return np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
 
-    def _heading_rad(self, t_ns: int) -> float:
-        """Heading of the wall's normal."""
-        if not self._yaw.count:
-            return self._yaw_rad
-        return wrap_rad(self._yaw_rad + float(self._yaw.at(t_ns).p_m[1]))
+    def _heading_rad(self) -> float:
+        """Heading of the wall's normal; of a wall that turns, the middle one."""
+        return wrap_rad(self._yaw_rad + float(self._yaw.middle[1]))
 
     def _command(
         self,

@@ -15,8 +15,9 @@ import numpy as np
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.transforms import Array
 
-POSITION_WALK_M_S = 0.02
-"""Random walk of the autopilot's position in the plane, metres per root second: that of optical flow."""
+POSITION_WALK_M_S = 0.03
+"""Random walk of where an opening seems to be, metres per root second: the autopilot's own position drifts by 0.02,
+and an eye that looks half a degree aside sees it move as it comes nearer."""
 
 MOVING_M_S2 = 0.4
 """Acceleration of a moving wall that the filter reckons with."""
@@ -24,7 +25,8 @@ MOVING_M_S2 = 0.4
 KEEP_S = 14.0
 LEAST_WAVE_S = 3.0
 PERIODS_S = np.geomspace(2.5, 16.0, 48)
-WAVE_FITS_M = 0.05
+WAVE_MEMORY_S, LATELY_S = 5.0, 0.4
+WAVE_FITS_M = 0.06
 """A wave is believed when it leaves this little (rms) of what was seen."""
 
 
@@ -39,9 +41,14 @@ class Motion:
 
 
 class PointTrack:
-    """A point seen now and then, each axis filtered for itself; times must not go back."""
+    """A point seen now and then, each axis filtered for itself; times must not go back.
 
-    def __init__(self) -> None:
+    Axes are along (x), across (y) and down (z) for a heading: a wall moves across and down, never along.
+    """
+
+    def __init__(self, yaw_rad: float = 0.0) -> None:
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        self._R_ned_wall: Array = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         self._seen: deque[tuple[int, Array]] = deque()
         self._x: Array = np.zeros((3, 2))
         self._P: Array = np.zeros((3, 2, 2))
@@ -60,17 +67,18 @@ class PointTrack:
         return self._wave
 
     def see(self, t_ns: int, p_ned_m: Array, sigma_m: Array) -> None:
-        """Take in where it was seen, with one sigma (3,) of each axis."""
+        """Take in where it was seen, with one sigma (3,) along, across and down."""
+        p = self._R_ned_wall.T @ p_ned_m
         if not self._seen:
-            self._x[:, 0] = p_ned_m
+            self._x[:, 0] = p
             self._P[:, 0, 0] = sigma_m**2
         else:
             self._x, self._P = self._carried(t_ns)
             gain = self._P[:, :, 0] / (self._P[:, 0, 0] + sigma_m**2)[:, None]
-            self._x = self._x + gain * (p_ned_m - self._x[:, 0])[:, None]
+            self._x = self._x + gain * (p - self._x[:, 0])[:, None]
             self._P = self._P - gain[:, :, None] * self._P[:, None, 0]
         self._t_ns = t_ns
-        self._seen.append((t_ns, p_ned_m))
+        self._seen.append((t_ns, p))
         while self._seen[0][0] < t_ns - KEEP_S * S:
             self._seen.popleft()
         if self.moves:
@@ -78,29 +86,38 @@ class PointTrack:
 
     def at(self, t_ns: int) -> Motion:
         """Return where it is, or will be, at a time."""
-        if self._wave is not None:
-            return self._wave.at(t_ns)
         x, P = self._carried(t_ns)
-        return Motion(x[:, 0], x[:, 1], np.zeros(3), math.sqrt(float(P[:, 0, 0].max())))
+        p, v, a, sigma_m = x[:, 0], x[:, 1], np.zeros(3), math.sqrt(float(P[1:, 0, 0].max()))
+        if self._wave is not None:
+            swing = self._wave.at(t_ns)
+            p, v, a, sigma_m = np.array([p[0], *swing.p_m[1:]]), swing.v_m_s, swing.a_m_s2, self._wave.rms_m
+        R = self._R_ned_wall
+        return Motion(R @ p, R @ v, R @ a, sigma_m)
 
     def _carried(self, t_ns: int) -> tuple[Array, Array]:
         dt = max(0.0, (t_ns - self._t_ns) / S)
         noise = np.zeros((3, 2, 2))
-        noise[:2, 0, 0] = POSITION_WALK_M_S**2 * dt
-        noise[2, 0, 0] = (0.25 * POSITION_WALK_M_S) ** 2 * dt
-        if not self.moves:
-            return self._x * [1.0, 0.0], self._P * [[1.0, 0.0], [0.0, 0.0]] + noise
-        F = np.array([[1.0, dt], [0.0, 1.0]])
-        noise += MOVING_M_S2**2 * np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]])
-        return self._x @ F.T, np.asarray(F @ self._P @ F.T + noise)
+        noise[:, 0, 0] = POSITION_WALK_M_S**2 * dt
+        F = np.array([np.eye(2)] * 3)
+        if self.moves:
+            F[1:, 0, 1] = dt
+            noise[1:] += MOVING_M_S2**2 * np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]])
+        return np.einsum("kij,kj->ki", F, self._x), np.asarray(F @ self._P @ F.transpose(0, 2, 1) + noise)
+
+    @property
+    def middle(self) -> Array:
+        """Where it is on the average, along, across and down: the middle of its wave, or the mean of what was seen."""
+        if self._wave is not None:
+            return self._wave.centre
+        return np.mean([p for _, p in self._seen], axis=0) if self._seen else np.zeros(3)
 
     def spread_m(self, last_s: float) -> float:
-        """Return how far apart the places of the last seconds lie, 5th to 95th percentile, on the widest axis."""
-        recent = np.array([p for t, p in self._seen if t > self._t_ns - last_s * S])
-        if len(recent) < 5:
+        """Return how far apart the places of the last seconds lie, across, 10th to 90th percentile."""
+        recent = np.array([p[1] for t, p in self._seen if t > self._t_ns - last_s * S])
+        if len(recent) < 8:
             return 0.0
-        low, high = np.percentile(recent[:, 1:], [5.0, 95.0], axis=0)
-        return float((high - low).max())
+        low, high = np.percentile(recent, [10.0, 90.0])
+        return float(high - low)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,20 +136,23 @@ class Wave:
         phase = self.rate_rad_s * (t_ns - self.t0_ns) / S
         s, c, w = math.sin(phase), math.cos(phase), self.rate_rad_s
         swing = self.sine * s + self.cosine * c
-        return Motion(self.centre + swing, w * (self.sine * c - self.cosine * s), -w * w * swing, self.rms_m)
+        still = np.array([0.0, 1.0, 1.0])
+        v = w * (self.sine * c - self.cosine * s)
+        return Motion(self.centre + swing, still * v, -w * w * still * swing, self.rms_m)
 
 
 def fit_wave(seen: list[tuple[int, Array]]) -> Wave | None:
     """Return the wave through places (t_ns, p (3,)), None when they are too few or do not repeat.
 
-    Linear least squares for each of some periods, the best of them refined once; the newest places count most.
+    Linear least squares for each of some periods, the best of them refined once; the newest places count most. The
+    autopilot's position drifts meanwhile, so the wave is then shifted onto the last places.
     """
     t0_ns = seen[-1][0]
     t = np.array([(t_ns - t0_ns) / S for t_ns, _ in seen])
     if len(t) < 10 or -t[0] < LEAST_WAVE_S:
         return None
     p = np.array([place for _, place in seen])
-    weight = np.exp(t / 6.0)
+    weight = np.exp(t / WAVE_MEMORY_S)
     longest_s = 1.6 * float(-t[0])
     periods = PERIODS_S[longest_s >= PERIODS_S]
     if not periods.size:
@@ -145,7 +165,10 @@ def fit_wave(seen: list[tuple[int, Array]]) -> Wave | None:
     rms_m, x = fits[best]
     if rms_m > WAVE_FITS_M:
         return None
-    return Wave(t0_ns, 2 * math.pi / float(fine[best]), x[0], x[1], x[2], rms_m)
+    rate = 2 * math.pi / float(fine[best])
+    off = p - np.stack([np.ones_like(t), np.sin(rate * t), np.cos(rate * t)], axis=1) @ x
+    lately = np.exp(t / LATELY_S)
+    return Wave(t0_ns, rate, x[0] + lately @ off / lately.sum(), x[1], x[2], rms_m)
 
 
 def _harmonic(t: Array, p: Array, weight: Array, rate: float) -> tuple[float, Array]:

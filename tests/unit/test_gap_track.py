@@ -1,0 +1,60 @@
+"""A standing opening is averaged, a swaying one is led."""
+
+import math
+
+import numpy as np
+import pytest
+
+from morpheyes_daemon.strategies.gap_track import PointTrack, fit_wave
+
+S = 1_000_000_000
+SIGMA = np.full(3, 0.02)
+
+
+def sway(t_s):
+    return np.array([4.0, 0.5 * math.sin(t_s + 0.7), -1.4 + 0.15 * math.cos(t_s + 0.7)])
+
+
+def watched(where, seconds, noise_m=0.02, moves=False, yaw_rad=0.0):
+    track, rng = PointTrack(yaw_rad), np.random.default_rng(0)
+    for k in range(round(5 * seconds)):
+        track.see(k * S // 5, where(k / 5) + rng.normal(0.0, noise_m, 3), SIGMA)
+        track.moves = moves
+    return track, (round(5 * seconds) - 1) / 5
+
+
+def test_a_standing_point_is_known_better_than_it_is_seen():
+    track, t_s = watched(lambda t: np.array([4.0, 0.2, -1.5]), 6.0)
+    # noise 20 mm, averaged over some frames
+    assert track.at(round(t_s * S)).p_m == pytest.approx((4.0, 0.2, -1.5), abs=0.03)
+    assert track.at(round(t_s * S)).v_m_s == pytest.approx((0, 0, 0), abs=1e-9)
+    assert track.spread_m(3.0) < 0.1
+
+
+def test_a_wave_is_led_by_two_seconds():
+    track, t_s = watched(sway, 9.0, moves=True)
+    assert track.wave is not None
+    ahead = track.at(round((t_s + 2.0) * S))
+    # half a second of a 0.5 m/s wall would be 0.25 m
+    assert ahead.p_m[1:] == pytest.approx(sway(t_s + 2.0)[1:], abs=0.04)
+    assert ahead.v_m_s[1] == pytest.approx(0.5 * math.cos(t_s + 2.7), abs=0.06)
+
+
+def test_a_moving_point_wanders_more_than_a_standing_one():
+    track, _ = watched(sway, 4.0)
+    assert track.spread_m(3.0) > 0.2
+
+
+def test_a_wall_never_moves_along():
+    yaw = 0.6
+    R = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1.0]])
+    track, t_s = watched(lambda t: R @ sway(t), 9.0, moves=True, yaw_rad=yaw)
+    v = R.T @ track.at(round(t_s * S)).v_m_s
+    assert v[0] == pytest.approx(0.0, abs=1e-9)
+    assert abs(v[1]) > 0.1
+
+
+def test_jumping_about_is_no_wave():
+    rng = np.random.default_rng(1)
+    assert fit_wave([(k * S // 5, rng.normal(0.0, 0.4, 3)) for k in range(40)]) is None
+    assert fit_wave([(k * S // 5, sway(k / 5)) for k in range(5)]) is None

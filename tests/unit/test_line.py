@@ -1,0 +1,48 @@
+"""Between two commands the vehicle is brought back to its line, and along it as fast as was asked."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from morpheyes_daemon.control.line import CLIMB_MOST_M_S, LEAN_LAG_S, wanted_velocity
+from morpheyes_daemon.messages import Intent, Line, MissionCommand, VehicleState
+
+S = 1_000_000_000
+
+
+def command(line, v=(3.0, 0.0, 0.0)):
+    return MissionCommand(
+        seq=1, t_ns=0, expires_ns=S, intent=Intent.FLY, reason=None, v_ned_m_s=v, yaw_rad=0.0, height_m=None,
+        baseline_m=0.1, clear_m=5.0, measured_ns=0, p_measured_ned_m=(0.0, 0.0, 0.0), line=line,
+    )  # fmt: skip
+
+
+def test_without_a_line_the_command_stands():
+    assert wanted_velocity(command(None), VehicleState(), 0) == (3.0, 0.0, 0.0)
+
+
+def test_beside_the_line_it_goes_back_and_keeps_its_speed_along():
+    vehicle = VehicleState(p_ned_m=(1.0, 0.2, -1.5))
+    v = wanted_velocity(command(Line(0, (7.0, 0.0, -1.4), gain_1_s=2.0)), vehicle, 0)
+    assert v == pytest.approx((3.0, -0.4, 0.2))
+
+
+def test_a_point_is_held_when_no_speed_is_asked():
+    vehicle = VehicleState(p_ned_m=(1.0, 0.5, -1.5))
+    v = wanted_velocity(command(Line(0, (2.0, 0.5, -1.5), gain_1_s=0.5), (0.0, 0.0, 0.0)), vehicle, 0)
+    assert v == pytest.approx((0.5, 0.0, 0.0))
+
+
+def test_a_moving_line_is_led_by_the_lag_of_the_lean():
+    line = Line(0, (7.0, 0.0, -1.5), (0.0, 0.4, 0.0), (0.0, 0.2, 0.0), gain_1_s=1.0)
+    vehicle = VehicleState(p_ned_m=(0.0, 0.4 + 0.1, -1.5))
+    assert wanted_velocity(command(line), vehicle, S)[1] == pytest.approx(0.4 + 0.2 * (1.0 + LEAN_LAG_S))
+
+
+@given(st.tuples(*[st.floats(-50, 50)] * 3), st.tuples(*[st.floats(-50, 50)] * 3), st.floats(0.1, 3.0))
+def test_the_way_back_is_bounded(place, here, most):
+    line = Line(0, place, gain_1_s=2.0, most_m_s=most)
+    vn, ve, vd = wanted_velocity(command(line), VehicleState(p_ned_m=here), 0)
+    assert vn == pytest.approx(3.0)
+    assert abs(ve) <= most + 1e-9
+    assert abs(vd) <= CLIMB_MOST_M_S + 1e-9
