@@ -20,7 +20,7 @@ REACTION_S = 0.25
 RELEASE_S = 0.05
 """From the pilot's message to the release."""
 
-SETTLED_S = 4.0
+SETTLED_S = 4.2
 """After a fault was noticed: neutral for two seconds, a release repeated for one, and some."""
 
 STILL_S = 0.1
@@ -64,7 +64,7 @@ class Fault:
     def watched_s(self, state: State) -> float:
         """How long to look on: less where nothing moves that would have to stop."""
         settled_s = self.notice_s + (self.lasts_s or 0.0) + SETTLED_S
-        return self.watch_s if state in (State.ENGAGED, State.BRAKING) else min(self.watch_s, settled_s)
+        return self.watch_s if state is State.ENGAGED else min(self.watch_s, settled_s)
 
     @property
     def kind(self) -> str:

@@ -29,6 +29,7 @@ from morpheyes_daemon.experiments.flight import (
     memory_opener,
 )
 from morpheyes_daemon.experiments.sabotage import FaultyCamera, FaultyWorker, Wire, lose
+from morpheyes_daemon.experiments.shared_pictures import SharedStage
 from morpheyes_daemon.experiments.stage import Stage, StageCamera
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.perception import PipelineFactory
@@ -93,7 +94,7 @@ class FaultFlight:
         self.rng = random.Random(f"faults {plan.scenario.seed}")
         topics, events = Topics.create(), EventLog()
         self.topics = topics
-        self.stage = Stage(plan.scenario, plan.config, self.clock, 1)  # threads would not survive a fork
+        self.stage = SharedStage(plan.scenario, plan.config, self.clock, folder)
         self.stage.autopilot.parameters.set("RSSI_TYPE", 3)
         self.crew = make_crew(self.stage)
         opener = memory_opener(self.stage)
