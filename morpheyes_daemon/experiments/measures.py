@@ -12,6 +12,7 @@ from morpheyes_daemon.experiments.stage import Stage
 
 MEASURES = {
     "gap": "morpheyes_daemon.experiments.gap_measures:GapMeasures",
+    "imo": "morpheyes_daemon.experiments.imo_measures:ImoMeasures",
 }
 """Strategy to the class that looks on."""
 

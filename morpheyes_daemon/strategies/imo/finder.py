@@ -31,6 +31,9 @@ from morpheyes_daemon.transforms import Array, inverse
 HITS, OF = 3, 5
 """A track is confirmed when it moved visibly in so many of so many frames."""
 
+MANY = 12
+"""So many tracklets that move together in one frame count as two frames."""
+
 STILL_S = 4.0
 """A track without any sign of own motion for so long is part of the scene."""
 
@@ -48,13 +51,13 @@ MIDDLE_PX = 3.0
 
 @dataclass(slots=True, eq=False)
 class _Candidate:
-    """A track on its way: its filter, the object's radius, and in which of the last frames it was seen to move."""
+    """A track on its way: its filter, the object's radius, and how clearly it was seen to move in the last frames."""
 
     id: int
     filter: ObjectFilter
     radius_m: float
     born_ns: int
-    moved: deque[bool] = field(default_factory=lambda: deque(maxlen=OF))
+    moved: deque[int] = field(default_factory=lambda: deque(maxlen=OF))
     confirmed: bool = False
     seen_ns: int = 0
     moved_ns: int = 0
@@ -114,17 +117,19 @@ class Finder:
 
     def _adopt(self, frame: Frame, depth: DepthMap) -> None:
         """Tell candidates which clusters are theirs; make new candidates of the rest."""
-        moved: set[int] = set()
+        moved: dict[int, int] = {}
         for cluster in self.clusters:
             p_ned = frame.T_ned_rect[:3, :3] @ cluster.p_rect + frame.T_ned_rect[:3, 3]
             owner = next((c for c in self._candidates if _owns(c, p_ned, cluster)), None)
             if owner is not None:
-                moved.add(owner.id)
+                owner.radius_m = _grown(owner.radius_m, cluster)
             elif cluster.radius_m < LARGEST_M and len(self._candidates) < 4:
-                moved.add(self._begin(cluster, p_ned, frame, depth))
+                owner = self._begin(cluster, p_ned, frame, depth)
+            if owner is not None:
+                moved[owner.id] = moved.get(owner.id, 0) + (2 if cluster.count >= MANY else 1)
         for candidate in self._candidates:
-            hit = candidate.id in moved and candidate.sighting is not None
-            candidate.moved.append(hit)
+            hit = moved.get(candidate.id, 0) if candidate.sighting is not None else 0
+            candidate.moved.append(min(hit, 2))
             if hit or self._has_moved(candidate, frame):
                 candidate.moved_ns = frame.t_ns
             if candidate.sighting is not None:
@@ -146,7 +151,7 @@ class Finder:
                     return True
         return False
 
-    def _begin(self, cluster: Cluster, p_ned: Array, frame: Frame, depth: DepthMap) -> int:
+    def _begin(self, cluster: Cluster, p_ned: Array, frame: Frame, depth: DepthMap) -> _Candidate:
         covariance = _in_ned(frame, measurement_covariance(cluster.p_rect, cluster.radius_m, _eyes(depth)))
         v_ned = frame.T_ned_rect[:3, :3] @ cluster.v_rect_m_s
         radius_m = max(cluster.radius_m, SMALLEST_M)
@@ -156,7 +161,7 @@ class Finder:
         candidate.seen_ns = candidate.moved_ns = frame.t_ns
         self._next_id += 1
         self._candidates.append(candidate)
-        return candidate.id
+        return candidate
 
     def _weed(self, t_ns: int) -> None:
         """Drop what is gone, what stands still, and what never became a track; the best first."""
@@ -209,6 +214,12 @@ def _eyes(depth: DepthMap) -> Eyes:
 def _owns(candidate: _Candidate, p_ned: Array, cluster: Cluster) -> bool:
     reach = candidate.radius_m + cluster.radius_m + 3.0 * float(np.sqrt(candidate.filter.P[:3, :3].trace()))
     return float(np.linalg.norm(p_ned - candidate.filter.p_ned_m)) < reach
+
+
+def _grown(radius_m: float, cluster: Cluster) -> float:
+    """Return the radius after a cluster that reaches further: what moves together belongs together."""
+    reach_m = min(cluster.radius_m, LARGEST_M)
+    return radius_m + 0.5 * max(0.0, reach_m - radius_m)
 
 
 def _in_ned(frame: Frame, covariance: Array) -> Array:
