@@ -213,7 +213,8 @@ class Line:
     """A path to keep to between two commands: through `p_ned_m` at `t_ns`, a point that moves with `v_ned_m_s` and
     `a_ned_m_s2`; the command's velocity goes along it, or, when it is zero, the point itself is held.
 
-    `gain_1_s` turns what is missing to the line into speed, at most `most_m_s` of it.
+    `gain_1_s` turns what is missing to the line into speed, at most `most_m_s` of it; `integral_1_s2` adds what wind
+    and drag keep missing.
     """
 
     t_ns: int
@@ -221,6 +222,7 @@ class Line:
     v_ned_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     a_ned_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gain_1_s: float = 1.5
+    integral_1_s2: float = 0.0
     most_m_s: float = 1.0
 
 

@@ -9,7 +9,7 @@ import math
 from dataclasses import replace
 
 from morpheyes_daemon.control.governor import Governor
-from morpheyes_daemon.control.line import wanted_velocity
+from morpheyes_daemon.control.line import LineKeeper
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.velocity import VelocityController, VelocityTuning, height_above_ground_m
 from morpheyes_daemon.messages import DepthSummary, Governed, MissionCommand, Sticks, VehicleState
@@ -22,23 +22,30 @@ class FlightControl:
         self.model = model
         self._governor = governor
         self._velocity = VelocityController(model, tuning)
+        self._line = LineKeeper()
 
     def reset(self) -> None:
         """Forget what the loop has learned; call while the sticks are not ours."""
         self._velocity.reset()
+        self._line.reset()
 
     def step(
         self, command: MissionCommand, summary: DepthSummary, vehicle: VehicleState, now_ns: int
     ) -> tuple[Sticks, Governed]:
         """Return the sticks for a command and what the governor made of its speed."""
         height_m = height_above_ground_m(vehicle, now_ns)
-        if command.line is not None:
-            command = replace(command, v_ned_m_s=wanted_velocity(command, vehicle, now_ns))
+        command = replace(command, v_ned_m_s=self._line.wanted_velocity(command, vehicle, now_ns))
         governed = self._governor.limit(command, summary, vehicle, self.model, height_m, now_ns)
         north, east, down = command.v_ned_m_s
         scale = min(1.0, governed.limit_m_s / governed.wanted_m_s) if governed.wanted_m_s > 0.0 else 0.0
         sticks = self._velocity.step(
-            now_ns, (north * scale, east * scale, down), command.yaw_rad, command.height_m, vehicle, command.coast
+            now_ns,
+            (north * scale, east * scale, down),
+            command.yaw_rad,
+            command.height_m,
+            vehicle,
+            command.coast,
+            quick=command.line is not None and command.line.integral_1_s2 > 0.0,
         )
         return self._reined(sticks, governed, vehicle, height_m), governed
 

@@ -18,28 +18,64 @@ CLIMB_MOST_M_S = 0.5
 LEAN_LAG_S = 0.15
 """A wanted velocity takes hold so much later (VelocityTuning.lean_lag_s)."""
 
+MISSED_MOST_M_S = 0.4
+"""A lateral wind of 3 m/s takes less from Loiter's speed than this."""
+
 AHEAD_MOST_S = 2.0
 """A moving line is not carried on for longer than this."""
 
 
-def wanted_velocity(command: MissionCommand, vehicle: VehicleState, now_ns: int) -> Vector3:
-    """Return the velocity (ned) that the command asks for at `now_ns`, with the way back to its line."""
-    line = command.line
-    if line is None:
-        return command.v_ned_m_s
-    place, moving = _line_at(line, now_ns)
-    north, east, down = (there - here for there, here in zip(place, vehicle.p_ned_m, strict=True))
-    vn, ve, vd = command.v_ned_m_s
-    speed = math.hypot(vn, ve)
-    back, along = (line.gain_1_s * north + moving[0], line.gain_1_s * east + moving[1]), (0.0, 0.0)
-    if speed > 0.0:
-        along = (vn / speed, ve / speed)
+class LineKeeper:
+    """Holds what is missing to the line over time; one per flight."""
+
+    def __init__(self) -> None:
+        self._missed = (0.0, 0.0, 0.0)
+        self._last_ns = 0
+
+    def reset(self) -> None:
+        """Forget what was missing."""
+        self._missed = (0.0, 0.0, 0.0)
+        self._last_ns = 0
+
+    def wanted_velocity(self, command: MissionCommand, vehicle: VehicleState, now_ns: int) -> Vector3:
+        """Return the velocity (ned) that the command asks for at `now_ns`, with the way back to its line."""
+        line = command.line
+        if line is None:
+            self.reset()
+            return command.v_ned_m_s
+        place, moving = _line_at(line, now_ns)
+        north, east, down = (there - here for there, here in zip(place, vehicle.p_ned_m, strict=True))
+        missed = self._gathered(line, (north, east, down), now_ns)
+        vn, ve, vd = command.v_ned_m_s
+        gain = line.gain_1_s
+        back = _across(
+            (gain * north + missed[0] + moving[0], gain * east + missed[1] + moving[1]), (vn, ve), line.most_m_s
+        )
+        climb = gain * down + missed[2] + moving[2]
+        return vn + back[0], ve + back[1], vd + max(-CLIMB_MOST_M_S, min(CLIMB_MOST_M_S, climb))
+
+    def _gathered(self, line: Line, off: Vector3, now_ns: int) -> Vector3:
+        """Return the integral of what is missing, each axis bounded."""
+        if line.integral_1_s2 == 0.0:
+            self.reset()
+            return self._missed
+        dt_s = min(0.1, (now_ns - self._last_ns) / S) if self._last_ns else 0.0
+        self._last_ns = now_ns
+        grown = (m + line.integral_1_s2 * o * dt_s for m, o in zip(self._missed, off, strict=True))
+        north, east, down = (max(-MISSED_MOST_M_S, min(MISSED_MOST_M_S, value)) for value in grown)
+        self._missed = (north, east, down)
+        return self._missed
+
+
+def _across(back: tuple[float, float], v: tuple[float, float], most_m_s: float) -> tuple[float, float]:
+    """Return the part of `back` across a velocity, all of it when that is zero, shortened to `most_m_s`."""
+    speed = math.hypot(*v)
+    along = (v[0] / speed, v[1] / speed) if speed > 0.0 else (0.0, 0.0)
     forward = back[0] * along[0] + back[1] * along[1]
     across = (back[0] - forward * along[0], back[1] - forward * along[1])
     size = math.hypot(*across)
-    scale = min(1.0, line.most_m_s / size) if size > 0.0 else 0.0
-    climb = vd + max(-CLIMB_MOST_M_S, min(CLIMB_MOST_M_S, line.gain_1_s * down + moving[2]))
-    return vn + scale * across[0], ve + scale * across[1], climb
+    scale = min(1.0, most_m_s / size) if size > 0.0 else 0.0
+    return scale * across[0], scale * across[1]
 
 
 def _line_at(line: Line, now_ns: int) -> tuple[Vector3, Vector3]:

@@ -30,11 +30,13 @@ BRAKE_LEAN_RAD = math.radians(8.0)
 class VelocityTuning:
     """Gains and bounds; the defaults are tuned on the identified Loiter plant (tests/unit/test_velocity.py).
 
+    `quick_response_1_s` takes the place of `response_1_s` on a line, where what is missing is steered by often.
     `lean_lag_s` is how far ahead velocity is predicted, about the delay of the lean. `brake_lean_rad` bounds the lean
     against the motion while slowing down, `stop_lean_rad` while stopping (0: neutral sticks, Loiter brakes).
     """
 
     response_1_s: float = 2.5
+    quick_response_1_s: float = 5.0
     integral_1_s2: float = 0.3
     integral_limit_m_s2: float = 0.8
     lean_lag_s: float = 0.15
@@ -64,16 +66,20 @@ class VelocityController:
         self.model = model
         self.tuning = tuning = tuning or VelocityTuning()
         gains = PidGains(tuning.response_1_s, tuning.integral_1_s2, i_limit=tuning.integral_limit_m_s2)
-        self._north, self._east = Pid(gains), Pid(gains)
+        quick = PidGains(tuning.quick_response_1_s, tuning.integral_1_s2, i_limit=tuning.integral_limit_m_s2)
+        self._calm, self._quick = (Pid(gains), Pid(gains)), (Pid(quick), Pid(quick))
         self._felt: Vector2 = (0.0, 0.0)
         self._last_ns = 0
 
     def reset(self) -> None:
         """Forget the integrals and what was commanded."""
-        self._north.reset()
-        self._east.reset()
+        self._forget()
         self._felt = (0.0, 0.0)
         self._last_ns = 0
+
+    def _forget(self) -> None:
+        for loop in (*self._calm, *self._quick):
+            loop.reset()
 
     def step(
         self,
@@ -83,15 +89,17 @@ class VelocityController:
         height_m: float | None,
         vehicle: VehicleState,
         coast: bool = False,
+        quick: bool = False,
     ) -> Sticks:
         """Return the sticks for a wanted velocity (ned), heading and height; None leaves heading or climb alone.
 
-        With a height the wanted vertical speed is ignored. `coast` keeps pitch and roll neutral.
+        With a height the wanted vertical speed is ignored. `coast` keeps pitch and roll neutral; `quick`
+        answers faster than is needed to fly a speed.
         """
         above_m = height_above_ground_m(vehicle, now_ns)
         dt_s = min(0.1, max(0.001, (now_ns - self._last_ns) / S)) if self._last_ns else 0.02
         self._last_ns = now_ns
-        push = None if coast else self._push(now_ns, dt_s, v_ned_m_s, vehicle, above_m)
+        push = None if coast else self._push(now_ns, dt_s, v_ned_m_s, vehicle, above_m, quick)
         self._feel(push or (0.0, 0.0), dt_s)
         roll_us, pitch_us = self._lean_sticks(push, vehicle.yaw_rad)
         climb = -v_ned_m_s[2] if height_m is None else self._climb_m_s(height_m - above_m)
@@ -102,20 +110,27 @@ class VelocityController:
         )
 
     def _push(
-        self, now_ns: int, dt_s: float, v_ned_m_s: tuple[float, float, float], vehicle: VehicleState, above_m: float
+        self,
+        now_ns: int,
+        dt_s: float,
+        v_ned_m_s: tuple[float, float, float],
+        vehicle: VehicleState,
+        above_m: float,
+        quick: bool,
     ) -> Vector2 | None:
         """Return the acceleration (north, east) to lean for, drag not counted; None for neutral sticks."""
         stopping = math.hypot(v_ned_m_s[0], v_ned_m_s[1]) < STANDSTILL_M_S
         predicted = self._predicted_m_s(now_ns, vehicle, above_m)
         if stopping and (self.tuning.stop_lean_rad == 0.0 or math.hypot(*predicted) < 3 * STANDSTILL_M_S):
-            self._north.reset()
-            self._east.reset()
+            self._forget()
             return None
         wanted = (0.0, 0.0) if stopping else (v_ned_m_s[0], v_ned_m_s[1])
         most = G_M_S2 * math.tan(min(self.tuning.max_lean_rad, self.model.lean_max_rad))
         north, east = (
             loop.step(want - have, dt_s, -most, most, self.model.drag_m_s2(want, above_m))
-            for loop, want, have in zip((self._north, self._east), wanted, predicted, strict=True)
+            for loop, want, have in zip(
+                self._quick if quick else self._calm, wanted, predicted, strict=True
+            )
         )
         brake_lean = self.tuning.stop_lean_rad if stopping else self.tuning.brake_lean_rad
         return _bounded((north, east), predicted, self.tuning.max_lean_rad, brake_lean)

@@ -22,10 +22,13 @@ from morpheyes_daemon.simulation.worlds import load_world
 from morpheyes_daemon.stereo.rectify import Rectifier
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.gap import GapPercept
-from morpheyes_daemon.transforms import Array, inverse
+from morpheyes_daemon.transforms import Array, inverse, rpy_from_R
 
 BESIDE_M = 0.6
 """The vehicle's centre this near to the wall's plane: it is in the opening."""
+
+SHOWN_M, APART_M = 2.6, 0.42
+"""The stretch of the way that the figure shows, and how far apart the vehicles in it are."""
 
 FRAMES_KEPT = 16
 
@@ -42,6 +45,7 @@ class GapMeasures:
         self._clearance_m = math.inf
         self._crossing_m_s = math.nan
         self._before_m = math.nan
+        self._sequence: list[list[float]] = []
         self._text = ""
 
     def attach(self, daemon: Daemon, stage: Stage) -> None:
@@ -61,6 +65,7 @@ class GapMeasures:
             "shape": shape,
             "motion": motion,
             "text": self._text,
+            "sequence": self._sequence,
         }
 
     def _keep(self, frame: StereoFrame) -> None:
@@ -89,12 +94,21 @@ class GapMeasures:
     def _watch(self, out: GateOutput, stage: Stage) -> None:
         gap = stage.world.gaps[0]
         truth = stage.truth(out.t_ns)
-        past_m = _past_wall_m(gap.T_ned_wall(stage.world_s(out.t_ns)), truth.T_ned_frd)
+        T_wall_frd = inverse(gap.T_ned_wall(stage.world_s(out.t_ns))) @ truth.T_ned_frd
+        past_m = float(T_wall_frd[0, 3])
         if self._before_m < 0.0 <= past_m:
             self._crossing_m_s = math.hypot(*truth.v_ned_m_s)
         self._before_m = past_m
+        self._note(T_wall_frd, stage.baseline_m(out.t_ns))
         if abs(past_m) < BESIDE_M:
             self._clearance_m = min(self._clearance_m, stage.clearance_m(out.t_ns))
+
+    def _note(self, T_wall_frd: Array, baseline_m: float) -> None:
+        """Keep a pose for the figure wherever the vehicle has come on by `APART_M` towards the wall or behind it."""
+        x, y, z = (float(c) for c in T_wall_frd[:3, 3])
+        if abs(x) < SHOWN_M and (not self._sequence or x > self._sequence[-1][0] + APART_M):
+            pose = (x, y, z, *rpy_from_R(T_wall_frd[:3, :3]), baseline_m)
+            self._sequence.append([round(value, 4) for value in pose])
 
     def _hear(self, command: MissionCommand) -> None:
         if command.intent is Intent.REFUSE:

@@ -66,15 +66,21 @@ def drawn_shape(shape: Shape | Literal["any"], seed: int) -> Shape:
     return named[seed % (BLOBS + 3)] if seed % (BLOBS + 3) < 3 else "blob"
 
 
+def gap_truth(world: GapWorld, seed: int) -> GapTruth:
+    """Return where the openings are and how the wall moves."""
+    outlines, middle = _place(world, np.random.default_rng([seed, 500]), seed)
+    T_ned_wall = swaying(world.motion, np.array([world.distance_m, middle, 0.0]), seed)
+    return GapTruth(outlines, T_ned_wall, world.thickness_mm / 1e3)
+
+
 def gap_contents(world: GapWorld, seed: int, light: Light) -> Contents:
     """Return wall, mural and ground."""
-    rng = np.random.default_rng([seed, 500])
-    outlines, middle = _place(world, rng, seed)
+    truth = gap_truth(world, seed)
+    T_ned_wall = truth.T_ned_wall
     wall = Wall(
-        np.array([-world.half_width_m, -world.top_m]), np.array([world.half_width_m, BELOW_GROUND_M]), outlines,
-        world.thickness_mm / 1e3,
+        np.array([-world.half_width_m, -world.top_m]), np.array([world.half_width_m, BELOW_GROUND_M]),
+        truth.outlines, truth.thickness_m,
     )  # fmt: skip
-    T_ned_wall = swaying(world.motion, np.array([world.distance_m, middle, 0.0]), seed)
     sun = light.direction
     dark = (0.6, 0.6, 0.6)
     parts = (
@@ -84,7 +90,7 @@ def gap_contents(world: GapWorld, seed: int, light: Light) -> Contents:
     standing = Contents(
         moving=(MovingObject(parts, T_ned_wall, "wall"),),
         obstacles=(MovingObstacles(Obstacles(wall.solids()), T_ned_wall),),
-        gaps=(GapTruth(outlines, T_ned_wall, wall.thickness_m),),
+        gaps=(truth,),
     ) + _mural(world, light)
     return standing + meadow() if world.meadow else standing
 

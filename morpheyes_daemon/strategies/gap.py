@@ -30,7 +30,7 @@ from morpheyes_daemon.transforms import Array, wrap_rad
 class GapParameters(StrategyParameters):
     """What `parameters:` of a gap mission may say."""
 
-    speed_m_s: float = Field(3.0, gt=0.2, le=6, description="through the opening; the governor is the real bound")
+    speed_m_s: float = Field(2.9, gt=0.2, le=6, description="through the opening; the governor is the real bound")
     approach_m_s: float = Field(1.2, gt=0.1, le=3, description="to the stand-off")
     stand_off_m: float = Field(4.0, gt=1.5, le=10, description="from here it measures, and takes its run")
     margin_m: float = Field(0.0, ge=0, le=0.5, description="measured room around the silhouette that it must have")
@@ -99,8 +99,10 @@ SLOW_M_S, TURNS_RAD = 0.2, math.radians(9.0)
 GATHER_S = 0.75
 """What gathering speed costs in time."""
 
-HOLD_1_S, RUN_1_S = 0.6, 2.5
-"""Gains on what is missing to the line; gentle before the wall, since a vehicle that brakes looks up."""
+HOLD_1_S, RUN_1_S, RUN_1_S2 = 0.6, 3.5, 1.5
+"""Gains on what is missing to the line and, on the run, on its integral.
+
+Gentle before the wall, since a vehicle that brakes looks up."""
 
 MOVES_M = 0.2
 """A place that wanders across by more within some seconds moves; the autopilot's drift is 0.05 m."""
@@ -250,6 +252,7 @@ class Gap(Strategy):
                 self._phase = Phase.CLOSE
             elif self._phase is Phase.CLOSE and self._closed(observation) and self._may_run(observation):
                 self._phase = Phase.RUN
+                self._track.near()
                 return self._run(observation)
         return self._hold(observation, opening, start, ahead, range_m)
 
@@ -259,7 +262,7 @@ class Gap(Strategy):
         """Go to the stand-off and follow the opening there."""
         line = Line(
             observation.now_ns, _three(start), _three(opening.v_m_s), _three(opening.a_m_s2), HOLD_1_S,
-            self.parameters.approach_m_s,
+            most_m_s=self.parameters.approach_m_s,
         )  # fmt: skip
         return self._command(
             observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(),
@@ -346,7 +349,9 @@ class Gap(Strategy):
             return self._approach(observation)
         beyond_m = range_m + self._beyond_m
         v = parameters.speed_m_s * ahead
-        line = Line(now_ns, _three(opening.p_m), _three(opening.v_m_s), _three(opening.a_m_s2), RUN_1_S, 1.0)
+        line = Line(
+            now_ns, _three(opening.p_m), _three(opening.v_m_s), _three(opening.a_m_s2), RUN_1_S, RUN_1_S2
+        )  # fmt: skip
         return self._command(
             observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(), v_ned_m_s=_three(v),
             clear_m=max(0.0, beyond_m - NOSE_M), z_m=beyond_m, contour_m=range_m,

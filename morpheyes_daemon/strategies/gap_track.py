@@ -15,12 +15,14 @@ import numpy as np
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.transforms import Array
 
-POSITION_WALK_M_S = 0.03
-"""Random walk of where an opening seems to be, metres per root second: the autopilot's own position drifts by 0.02,
-and an eye that looks half a degree aside sees it move as it comes nearer."""
+POSITION_WALK_M_S = 0.025
+"""Random walk of where an opening seems to be, metres per root second: the autopilot's own position drifts by 0.02."""
 
 MOVING_M_S2 = 0.4
 """Acceleration of a moving wall that the filter reckons with."""
+
+DRIFT_M_S, DRIFTING_M_S2 = 0.03, 0.03
+"""How fast a standing opening seems to drift: half a degree aside at 3 m/s is 0.026 m/s."""
 
 KEEP_S = 14.0
 LEAST_WAVE_S = 3.0
@@ -54,6 +56,7 @@ class PointTrack:
         self._P: Array = np.zeros((3, 2, 2))
         self._t_ns = 0
         self._wave: Wave | None = None
+        self._accel_m_s2: float | None = None
         self.moves = False
 
     @property
@@ -99,10 +102,17 @@ class PointTrack:
         noise = np.zeros((3, 2, 2))
         noise[:, 0, 0] = POSITION_WALK_M_S**2 * dt
         F = np.array([np.eye(2)] * 3)
-        if self.moves:
+        accel_m_s2 = MOVING_M_S2 if self.moves else self._accel_m_s2
+        if accel_m_s2 is not None:
             F[1:, 0, 1] = dt
-            noise[1:] += MOVING_M_S2**2 * np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]])
+            noise[1:] += accel_m_s2**2 * np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]])
         return np.einsum("kij,kj->ki", F, self._x), np.asarray(F @ self._P @ F.transpose(0, 2, 1) + noise)
+
+    def near(self) -> None:
+        """From now on a standing point is flown at: what an eye that looks aside makes it drift by is followed."""
+        if self._accel_m_s2 is None:
+            self._accel_m_s2 = DRIFTING_M_S2
+            self._P[1:, 1, 1] = DRIFT_M_S**2
 
     @property
     def middle(self) -> Array:

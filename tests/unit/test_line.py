@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morpheyes_daemon.control.line import CLIMB_MOST_M_S, LEAN_LAG_S, wanted_velocity
+from morpheyes_daemon.control.line import CLIMB_MOST_M_S, LEAN_LAG_S, MISSED_MOST_M_S, LineKeeper
 from morpheyes_daemon.messages import Intent, Line, MissionCommand, VehicleState
 
 S = 1_000_000_000
@@ -15,6 +15,10 @@ def command(line, v=(3.0, 0.0, 0.0)):
         seq=1, t_ns=0, expires_ns=S, intent=Intent.FLY, reason=None, v_ned_m_s=v, yaw_rad=0.0, height_m=None,
         baseline_m=0.1, clear_m=5.0, measured_ns=0, p_measured_ned_m=(0.0, 0.0, 0.0), line=line,
     )  # fmt: skip
+
+
+def wanted_velocity(order, vehicle, now_ns):
+    return LineKeeper().wanted_velocity(order, vehicle, now_ns)
 
 
 def test_without_a_line_the_command_stands():
@@ -37,6 +41,19 @@ def test_a_moving_line_is_led_by_the_lag_of_the_lean():
     line = Line(0, (7.0, 0.0, -1.5), (0.0, 0.4, 0.0), (0.0, 0.2, 0.0), gain_1_s=1.0)
     vehicle = VehicleState(p_ned_m=(0.0, 0.4 + 0.1, -1.5))
     assert wanted_velocity(command(line), vehicle, S)[1] == pytest.approx(0.4 + 0.2 * (1.0 + LEAN_LAG_S))
+
+
+def test_what_stays_missing_is_asked_for_more_and_more():
+    keeper, vehicle = LineKeeper(), VehicleState(p_ned_m=(1.0, 0.05, -1.5))
+    order = command(Line(0, (7.0, 0.0, -1.5), gain_1_s=2.0, integral_1_s2=3.0))
+    first, *_, last = (keeper.wanted_velocity(order, vehicle, k * S // 50)[1] for k in range(1, 51))
+    assert first == pytest.approx(-0.1)
+    assert last == pytest.approx(-0.1 - 3.0 * 0.05 * 49 / 50)
+    for k in range(51, 1000):
+        last = keeper.wanted_velocity(order, vehicle, k * S // 50)[1]
+    assert last == pytest.approx(-0.1 - MISSED_MOST_M_S)
+    keeper.reset()
+    assert keeper.wanted_velocity(order, vehicle, 1000 * S // 50)[1] == pytest.approx(-0.1)
 
 
 @given(st.tuples(*[st.floats(-50, 50)] * 3), st.tuples(*[st.floats(-50, 50)] * 3), st.floats(0.1, 3.0))
