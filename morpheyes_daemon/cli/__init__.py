@@ -18,6 +18,7 @@ COMMANDS = (
     "analyze",
     "experiment",
     "results",
+    "stills",
     "doctor",
     "faults",
     "bench",

@@ -14,3 +14,9 @@ def require_simulator() -> None:
         raise UsageError(
             f"the simulator needs {', '.join(missing)}; install it with: pip install 'morpheyes-daemon[sim]'."
         )
+
+
+def require_figures() -> None:
+    """Raise UsageError when Mitsuba, the `figures` extra, is missing."""
+    if find_spec("mitsuba") is None:
+        raise UsageError("path tracing needs mitsuba; install it with: pip install 'morpheyes-daemon[figures]'.")
