@@ -1,0 +1,146 @@
+"""The gap mission decides: it measures before it runs, refuses what is too small, and stops behind."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morpheyes_daemon.config import Footprint
+from morpheyes_daemon.control.line import LineKeeper
+from morpheyes_daemon.messages import DepthSummary, Intent, VehicleState
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.strategies.base import Craft, Observation
+from morpheyes_daemon.strategies.gap import Gap, GapParameters, GapPercept, Phase
+from morpheyes_daemon.strategies.opening import Opening, Place
+
+S = 1_000_000_000
+CRAFT = Craft(Footprint(), np.eye(4), (0.1, 0.3), 0.2, 3.0, 0.2)
+WALL_M, BEYOND_M = 7.0, 8.0
+
+
+def opening(place=(WALL_M, 0.2, -1.4), room_m=0.04, z_m=4.0, cut=False):
+    at = Place(place, room_m)
+    width, height = 0.337 + 2 * room_m, 0.187 + 2 * room_m
+    return Opening(np.zeros((4, 2), np.float32), z_m, (at,), at, width, height, BEYOND_M, cut)
+
+
+class Course:
+    """A vehicle that does at once what it is told, and a strategy that sees what `show` says."""
+
+    def __init__(self, show, **parameters):
+        self.strategy = Gap(GapParameters(**parameters), CRAFT)
+        self.show, self.now_ns = show, 10 * S
+        self.vehicle = VehicleState(p_ned_m=(0.0, 0.0, -1.5))
+        self.keeper = LineKeeper()
+        self.baseline_m = 0.3
+        self.commands, self.phases, self.ranges = [], [], []
+        self.step(engaged=False)
+
+    def step(self, engaged=True):
+        self.now_ns += S // 5
+        range_m = WALL_M - self.vehicle.p_ned_m[0]
+        percept = GapPercept(
+            t_ns=self.now_ns - S // 10, bimodal=True, separation=9.0, range_m=range_m, yaw_rad=0.0, near_limit_m=0.5,
+            scale_sigma=0.005, origin_ned_m=self.vehicle.p_ned_m, silhouette=self.strategy.silhouette,
+            openings=tuple(self.show(range_m)),
+        )  # fmt: skip
+        summary = DepthSummary(
+            1, self.now_ns, self.now_ns, self.baseline_m, 1e-4, 370.0, 0.8, 0.25, 0.5, 0.9, 0.0, 3.0, 0.01, "none"
+        )
+        speed = math.hypot(*self.vehicle.v_ned_m_s)
+        command = self.strategy.decide(
+            Observation(self.now_ns, percept, summary, self.vehicle, self.vehicle, self.baseline_m, speed, engaged)
+        )
+        self.commands.append(command)
+        self.phases.append(self.strategy._phase)
+        self.ranges.append(range_m)
+        self.baseline_m += max(-0.01, min(0.01, command.baseline_m - self.baseline_m))
+        v = self.keeper.wanted_velocity(command, self.vehicle, self.now_ns) if command.intent is Intent.FLY else (0, 0, 0)
+        north, east, down = (p + 0.2 * u for p, u in zip(self.vehicle.p_ned_m, v, strict=True))
+        self.vehicle = replace(self.vehicle, p_ned_m=(north, east, down), v_ned_m_s=tuple(float(u) for u in v))
+        return command
+
+    def fly(self, seconds):
+        for _ in range(round(5 * seconds)):
+            command = self.step()
+            if command.intent in (Intent.DONE, Intent.REFUSE):
+                return command
+        return command
+
+
+def seen_from_afar(range_m, **what):
+    return [opening(z_m=range_m, **what)] if range_m > 0.7 else []
+
+
+def test_it_measures_closes_the_eyes_runs_through_and_stops_behind():
+    course = Course(seen_from_afar)
+    last = course.fly(30.0)
+    assert (last.intent, last.reason) == (Intent.DONE, Reason.GOAL_REACHED)
+    met = list(dict.fromkeys(course.phases))
+    assert met == [Phase.APPROACH, Phase.CLOSE, Phase.RUN, Phase.BEHIND, Phase.OVER]
+    through = min(zip(course.ranges, course.commands, strict=True), key=lambda pair: abs(pair[0]))[1]
+    assert through.line.p_ned_m[1:] == pytest.approx((0.2, -1.4), abs=0.01)
+    assert course.vehicle.p_ned_m[0] > WALL_M + 0.5
+
+
+def test_before_the_run_the_wall_is_where_free_space_ends():
+    course = Course(seen_from_afar)
+    course.fly(30.0)
+    rows = zip(course.phases, course.ranges, course.commands, strict=True)
+    for phase, range_m, command in rows:
+        if phase in (Phase.APPROACH, Phase.CLOSE):
+            assert command.clear_m < max(range_m, 0.0)
+        if phase is Phase.RUN:
+            assert command.clear_m <= range_m + BEYOND_M
+            assert command.baseline_m == CRAFT.baseline_range_m[0]
+
+
+def test_the_run_waits_until_the_eyes_are_together():
+    course = Course(seen_from_afar)
+    course.fly(30.0)
+    first = course.phases.index(Phase.RUN)
+    closing = [command for command, phase in zip(course.commands, course.phases, strict=True) if phase is Phase.CLOSE]
+    assert closing
+    assert first - course.phases.index(Phase.CLOSE) >= 5
+
+
+def test_what_is_too_small_is_refused_with_its_size_and_its_own():
+    course = Course(lambda range_m: seen_from_afar(range_m, room_m=-0.03))
+    last = course.fly(40.0)
+    assert (last.intent, last.reason) == (Intent.REFUSE, Reason.MISSION_REFUSED)
+    assert "0.28 x 0.13 m" in last.text
+    assert "0.34 x 0.19 m" in last.text
+    assert "baseline of 100 mm" in last.text
+    assert WALL_M - course.vehicle.p_ned_m[0] > 3.0
+
+
+def test_of_several_openings_it_takes_the_one_with_most_room():
+    def two(range_m):
+        place = (WALL_M, -0.6, -1.6)
+        return [*seen_from_afar(range_m, room_m=0.01), *seen_from_afar(range_m, room_m=0.2, place=place)]
+
+    course = Course(two)
+    assert course.fly(30.0).reason is Reason.GOAL_REACHED
+    assert course.vehicle.p_ned_m[1] == pytest.approx(-0.6, abs=0.05)
+
+
+def test_without_an_opening_it_refuses_after_a_look():
+    course = Course(lambda range_m: [], look_s=5.0)
+    last = course.fly(20.0)
+    assert (last.intent, last.text) == (Intent.REFUSE, "no opening in the wall")
+    assert course.vehicle.p_ned_m[0] == 0.0
+
+
+def test_an_opening_lost_at_the_start_of_the_run_breaks_it_off():
+    course = Course(lambda range_m: seen_from_afar(range_m) if range_m > 3.6 else [], speed_m_s=0.8)
+    course.fly(14.0)
+    assert Phase.RUN in course.phases
+    after = course.phases[course.phases.index(Phase.RUN) :]
+    assert Phase.CLOSE in after
+    assert course.vehicle.p_ned_m[0] < WALL_M
+
+
+def test_an_opening_that_is_cut_is_not_chosen():
+    course = Course(lambda range_m: seen_from_afar(range_m, cut=True), look_s=3.0)
+    assert course.fly(10.0).intent is Intent.REFUSE
