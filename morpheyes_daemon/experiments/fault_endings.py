@@ -20,8 +20,9 @@ REACTION_S = 0.25
 RELEASE_S = 0.05
 """From the pilot's message to the release."""
 
-SETTLED_S = 4.2
-"""After a fault was noticed: neutral for two seconds, a release repeated for one, and some."""
+SETTLED_S = {State.PREFLIGHT: 4.2, State.STANDBY: 2.2, State.HOLD: 2.8, State.BRAKING: 4.2}
+"""How long it takes to see the end of a fault that was noticed: on the ground the daemon starts, an autopilot restarts
+in two seconds, out of HOLD neutral lasts two seconds before the release, and braking ends after four."""
 
 STILL_S = 0.1
 """A stream whose last message is older than this has ended."""
@@ -63,8 +64,9 @@ class Fault:
 
     def watched_s(self, state: State) -> float:
         """How long to look on: less where nothing moves that would have to stop."""
-        settled_s = self.notice_s + (self.lasts_s or 0.0) + SETTLED_S
-        return self.watch_s if state is State.ENGAGED else min(self.watch_s, settled_s)
+        if state is State.ENGAGED:
+            return self.watch_s
+        return min(self.watch_s, self.notice_s + (self.lasts_s or 0.0) + SETTLED_S[state])
 
     @property
     def kind(self) -> str:
@@ -72,11 +74,15 @@ class Fault:
         return "B" if Ending.STOPS in self.endings.values() else "A"
 
 
+NOT_OURS = (Ending.RELEASES, Ending.READY, Ending.UNREADY)
+"""The pilot flies, so what is hit is hit by him; that we sent nothing is asked of each."""
+
+
 def complaints(fault: Fault, state: State, seen: Measured) -> list[str]:
     """Return what did not end as the table says; empty when all did."""
     ending = fault.endings[state]
     found = list(_RULES[ending](fault, state, seen))
-    ours = not fault.falls and ending is not Ending.RELEASES
+    ours = not fault.falls and ending not in NOT_OURS
     if seen.clearance_m < 0.0 and ours:
         found.append(f"hit an obstacle ({seen.clearance_m:.2f} m)")
     return found

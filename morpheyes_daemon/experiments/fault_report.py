@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import groupby
 
 from morpheyes_daemon.experiments.fault_run import Row
@@ -20,16 +21,18 @@ _HEAD = (
 )
 
 
-def page(rows: list[Row], seeds: tuple[int, ...], settings: str) -> str:
-    """Return docs/faults.md for the rows of a run."""
+def page(rows: list[Row], settings: str) -> str:
+    """Return docs/faults.md for the rows of a run, sorted by fault and state."""
     passed = sum(row.passed for row in rows)
     faults = len({row.fault for row in rows})
+    each = Counter((row.fault, row.state) for row in rows).values()
+    seeds = f"{min(each)}" if min(each) == max(each) else f"{min(each)} to {max(each)}"
     return "\n".join(
         (
             "# Fault matrix",
             "",
-            f"{faults} faults, {len(rows)} flights ({len(seeds)} seeds), {passed} ended as the table says"
-            f" ({passed / len(rows):.1%}). Flown in the lockstep simulator by `morpheyes faults` ({settings}).",
+            f"{faults} faults in {len(each)} rows, {len(rows)} flights ({seeds} seeds each), {passed} ended as the"
+            f" table says ({passed / len(rows):.1%}), in the lockstep simulator (`morpheyes faults {settings}`).",
             "",
             "Class A: the daemon lives; from the fault to neutral sticks on the wire it may take 250 ms on top of what"
             " it takes to notice (*allowed* is the sum; for the pilot, 50 ms on top of his message's period). Class B:"

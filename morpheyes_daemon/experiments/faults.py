@@ -21,6 +21,9 @@ APART_S, SCALE_S, REBOOT_S = 3.0, 4.5, 0.8
 """Eight frames that turn or pitch; the servos' way to where depth is a third too large, five frames and latency;
 the Teensy's boot and its next STATUS."""
 
+EKF_S = 2.0
+"""The autopilot's own failsafe comes 1.9 s after its aiding is lost."""
+
 HEARTBEAT_S, RC_S, STATUS_S, PICTURE_S = 0.1, 0.05, 0.5, 0.3
 """Periods of the messages, and of a picture with its matching."""
 
@@ -117,7 +120,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "calibration-other",
         "calibration of another rig",
-        0.0,
+        APART_S,
         _row(*[None] * 4, ground=E.UNREADY),
         rig_seed=3,
         watch_s=12.0,
@@ -143,7 +146,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "servo-ran-in",
         "so they did before the pilot engaged",
-        SCALE_S,
+        SCALE_S + 2.0,
         _row(*[None] * 3, E.HOLDS),
         acts.servo(ServoFault.RUNS_IN),
         acts.engage,
@@ -179,7 +182,12 @@ FAULTS: tuple[Fault, ...] = (
     Fault("link-doubled", "every message twice, both ways", 0.0, _HARMLESS, acts.doubling_link),
     Fault("forged-sender", "a stranger says: switch off, disarmed", 0.0, _HARMLESS, acts.forge),
     Fault(
-        "autopilot-reboot", "the autopilot restarts, motors stop", VEHICLE_S, _LEFT, acts.reboot_autopilot, falls=True
+        "autopilot-reboot",
+        "the autopilot restarts, motors stop",
+        VEHICLE_S,
+        _row(E.LETS_GO, E.LETS_GO, E.LETS_GO, E.READY),
+        acts.reboot_autopilot,
+        falls=True,
     ),
     Fault(
         "overrides-ignored",
@@ -210,7 +218,7 @@ FAULTS: tuple[Fault, ...] = (
         _row(E.RELEASES, E.RELEASES, E.RELEASES, E.UNREADY),
         acts.upset_ekf,
     ),
-    Fault("aiding-lost", "GPS or optical flow is lost", 6.0, _LEFT, acts.lose_aiding, watch_s=12.0),
+    Fault("aiding-lost", "GPS or optical flow is lost", EKF_S, _LEFT, acts.lose_aiding, watch_s=12.0),
     Fault("battery-low", "10 % of charge left", STATUS_S, _STOPPED, acts.drain_battery),
     Fault(
         "gcs-lost",
