@@ -123,7 +123,7 @@ def bench_gap(plan: FlightPlan, repeats: int, report: Report) -> GapBench:
     )
 
 
-def gap_view(plan: FlightPlan, k: int) -> GapView:
+def gap_view(plan: FlightPlan, k: int, stack: int = STACK) -> GapView:
     """Render the k-th view: another wall every time, the ranges in turn, a little off the opening's axis."""
     loop = VirtualLoop()
     stage = Stage(with_seed(plan, k).scenario, plan.config, VirtualClock(loop))
@@ -142,10 +142,10 @@ def gap_view(plan: FlightPlan, k: int) -> GapView:
         return stage.camera.render_pair(t_ns, seq, lambda _: body, actual_m)
 
     pair = left_at(0.0, 0)
-    stack = tuple(left_at(STEP_M * (j + 1), j + 1).left for j in range(STACK))
+    others = tuple(left_at(STEP_M * (j + 1), j + 1).left for j in range(stack))
     T_ned_cam0 = stage.camera.T_ned_eye(0, pose(np.eye(3), place), actual_m)
     stage.close()
     loop.close()
     frame = StereoFrame(k, t_ns, pair.left, pair.right, BaselineEstimate(t_ns, nominal_m, nominal_m, 1e-4, False))
     north, east, down = (float(x) for x in place)
-    return GapView(frame, VehicleState(p_ned_m=(north, east, down)), stack, gap, T_ned_cam0)
+    return GapView(frame, VehicleState(p_ned_m=(north, east, down)), others, gap, T_ned_cam0)
