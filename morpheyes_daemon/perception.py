@@ -142,7 +142,8 @@ class Pipeline:
         """Return why the frame must not be flown on, empty when it may."""
         found = exposure_faults(pair.left, pair.right)
         found |= matching_faults(pair.left, pair.right, depth.valid_fraction)
-        found |= self._alike.check(pair.left, offsets, depth.pinhole.f_px)
+        left_over = self._drift.unexplained(offsets, depth)
+        found |= self._alike.check(pair.left, left_over, depth.pinhole.f_px, self._drift.knows(depth))
         if self._frozen.check(frame.left, frame.right):
             found.add(ImageFault.FROZEN)
         reasons = {_REASONS.get(fault, Reason.IMAGE_BAD) for fault in found}

@@ -19,7 +19,7 @@ from morpheyes_daemon.calibration.ego_motion import EyeMotion, row_rates
 from morpheyes_daemon.calibration.yaw_watch import Look, Uncertain, YawWatch
 from morpheyes_daemon.messages import DepthMap
 from morpheyes_daemon.stereo.depth import RectifiedPair, disparity_of
-from morpheyes_daemon.stereo.epipolar import RowFit, RowOffsets, RowWatch
+from morpheyes_daemon.stereo.epipolar import SHARP_S, RowFit, RowOffsets, RowWatch, levelled
 from morpheyes_daemon.stereo.rectify import rectifying_rotation
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
@@ -47,14 +47,16 @@ class DriftLimits:
     """... and so many before a correction while the lateness is not measured: a manoeuvre then looks like a turn."""
     points: int = 80
     """Points that a frame must have to count at all."""
-    largest_rad: float = math.radians(0.6)
-    """A turn beyond this is no drift: something broke, and the calibration must be made again."""
+    small_rad: float = math.radians(0.2)
+    """A turn up to this is watched and corrected before it is held against the frame."""
+    largest_rad: float = math.radians(0.25)
+    """A turn beyond this, all in all, is no drift: something broke, or it is the calibration of another rig."""
     late_s: float = 2e-3
     """Time offset between the eyes that was declared."""
     late_change_s: float = 1e-3
     """How far the measured offset may be from it."""
     baseline_share: float = 0.05
-    """A frame whose baseline is not known to this share tells nothing of the yaw."""
+    """A frame whose baseline is not known to this share tells nothing."""
 
 
 class Drift(StrEnum):
@@ -123,19 +125,16 @@ class DriftMonitor:
     ) -> DriftReport:
         """Look at one pair rectified by `rig`, its depth map and row offsets, and the eye's motion.
 
-        A frame with the servo moving tells nothing of the rows, and of the yaw what its baseline's sigma lets it.
+        Nothing is corrected while the servo moves, and a frame whose baseline is hardly known does not count.
         """
-        if offsets.count < self.limits.points:
+        if offsets.count < self.limits.points or not self.knows(depth):
             self._agreeing = 0
             return self._report(offsets.median_px, offsets.count, self._fit, ())
         f_px, nominal_m = depth.pinhole.f_px, pair.rectification.nominal_m
-        findings = []
-        if not moving:
-            rates = row_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, motion)
-            self._fit = self._rows.add(offsets, depth.pinhole, *rates)
-            findings += self._judge_rows(offsets.median_px, f_px, nominal_m)
-        known = depth.baseline_sigma_m < self.limits.baseline_share * depth.baseline_m
-        if known and not findings and offsets.median_px < 2 * self.limits.rows_px:
+        rates = row_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, motion)
+        self._fit = self._rows.add(offsets, depth.pinhole, *rates)
+        findings = [] if moving else self._judge_rows(offsets.median_px, f_px, nominal_m)
+        if not findings and offsets.median_px < 2 * self.limits.rows_px:
             seen = (disparity_of(depth), depth.baseline_m, depth.baseline_sigma_m, depth.pinhole, motion)
             self._yaw.add(Look(depth.t_ns, pair.left, pair.right, *seen, *self._late))
             findings += self._judge_yaw(f_px, nominal_m)
@@ -144,6 +143,17 @@ class DriftMonitor:
         if report.rig_changed:
             self._forget()
         return report
+
+    def knows(self, depth: DepthMap) -> bool:
+        """Return whether the baseline of a frame is known well enough for its rows to mean anything."""
+        return depth.baseline_sigma_m < self.limits.baseline_share * depth.baseline_m
+
+    def unexplained(self, offsets: RowOffsets, depth: DepthMap) -> RowOffsets:
+        """Return row offsets less those of a small turn that is being watched."""
+        fit = self._fit
+        if fit is None or max(abs(fit.pitch_rad), abs(fit.roll_rad)) > self.limits.small_rad:
+            return offsets
+        return levelled(offsets, depth.pinhole, fit)
 
     @property
     def _late(self) -> tuple[float, float]:
@@ -194,7 +204,7 @@ class DriftMonitor:
 
     def _judge_late(self) -> list[DriftFinding]:
         fit, limits = self._fit, self.limits
-        if fit is None or fit.late_sigma_s > 0.25 * limits.late_change_s or self._agreeing:
+        if fit is None or fit.late_sigma_s > SHARP_S or self._agreeing:
             return []
         off_s = abs(abs(fit.late_s) - limits.late_s)
         if off_s < limits.late_change_s + 3.0 * fit.late_sigma_s:

@@ -109,6 +109,9 @@ def evaluate(
     separate: Annotated[
         Path | None, typer.Option("--separate", help="The rendered folder: also solve every baseline by itself.")
     ] = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Also bend the twin, and let its eyes expose late, before the drift watch.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare a solved file with the truth of the simulator's rig, at 41 baselines."""
@@ -126,6 +129,14 @@ def evaluate(
         chosen = choose_board(read_board_file(separate), None, None, None)
         with progress_line() as progress:
             figures["at_calibrated_baselines"] = compare_separate(separate, chosen, rig, twin, progress)
+    if watch:
+        from morpheyes_daemon.cli.extras import require_simulator
+
+        require_simulator()
+        from morpheyes_daemon.experiments.drift_trial import watch_figures
+
+        with progress_line() as progress:
+            figures["watch"] = watch_figures(rig, twin.seed, progress)
     if as_json:
         typer.echo(json.dumps(figures, indent=2))
         return
@@ -146,6 +157,8 @@ def evaluate(
         f"all 41: rows {truth.epipolar_median_px:.3f} px median, {truth.epipolar_p95_px:.3f} px at 95 %; length "
         f"within {truth.baseline_error_max_mm:.3f} mm; disparity bias within {truth.disparity_bias_max_px:.3f} px"
     )
+    if watch:
+        _print_watch(figures["watch"])
     for name, row in figures.get("at_calibrated_baselines", {}).items():
         typer.echo(f"{name}: " + ", ".join(f"{key} {value}" for key, value in row.items()))
 
@@ -228,6 +241,20 @@ def _print_solved(solved: Solved, out: Path) -> None:
         typer.echo(f"to do better: {advice}")
     typer.echo(f"{solved.verdict.text}")
     typer.echo(f"written: {out}; look at it with: morpheyes calibrate report {out}")
+
+
+def _print_watch(figures: dict[str, Any]) -> None:
+    drift = figures["drift"]
+    for text in drift["said"]:
+        typer.echo(text)
+    typer.echo(
+        f"bent by {drift['bent_pitch_deg']:g} deg in pitch and yaw: rows {drift['before_epipolar_median_px']:.3f} px, "
+        f"disparity bias {drift['before_disparity_bias_px']:.3f} px; corrected: {drift['epipolar_median_px']:.3f} px "
+        f"and {drift['disparity_bias_px']:.3f} px"
+    )
+    for late in figures["late"]:
+        measured = f"{late['measured_ms']:.2f} ± {late['sigma_ms']:.2f} ms"
+        typer.echo(f"right eye {late['true_ms']:g} ms late: measured {measured}")
 
 
 def _print_table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:

@@ -15,7 +15,7 @@ from morpheyes_daemon.theory import sync
 from morpheyes_daemon.theory.calibration_error import (
     EXTRINSIC,
     FOCAL_LENGTHS_MM,
-    INTRINSIC,
+    SWEPT,
     EyePair,
     extrinsic_error,
     intrinsic_error,
@@ -161,7 +161,7 @@ def intrinsic_rows(subject: Subject) -> list[dict[str, Any]]:
             **_curves([intrinsic_error(lens, name, float(e)) for e in ERRORS_PCT]),
         }
         for label, lens in subject.lenses.items()
-        for name in INTRINSIC
+        for name in SWEPT
     ]
 
 

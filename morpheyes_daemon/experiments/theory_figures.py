@@ -27,14 +27,15 @@ SYMBOLS = {
     "k1": "k_1",
     "k2": "k_2",
     "k3": "k_3",
+    "k4": "k_4",
     "k5": "k_5",
     "T": "T_x",
     "phi": r"\phi",
     "theta": r"\theta",
     "psi": r"\psi",
 }
-FIGURE_2 = (("f", "y"), ("alpha", "x"), ("k1", "x"), ("k2", "y"), ("k3", "y"), ("k5", "y"))
-"""Which error the paper's figure 2 shows in its panels (a) to (f)."""
+FIGURE_2 = (("f", "y"), ("alpha", "x"), ("k1", "x"), ("k2", "y"), ("k3", "y"), ("k5", "y"), ("k4", "x"))
+"""Which error the paper's figure 2 shows in its panels (a) to (f), and k4, which it leaves out."""
 
 
 def draw_all(out: Path, subject: Subject, numbers: dict[str, Any]) -> list[Path]:
@@ -125,13 +126,13 @@ def _depth_error(subject: Subject, numbers: dict[str, Any]) -> Any:
 
 def _intrinsic_errors(subject: Subject, numbers: dict[str, Any]) -> Any:
     figure = _figure(
-        11.0, 6.6, "Pixel error for an error in one intrinsic number (paper, figure 2)",
+        13.5, 6.6, "Pixel error for an error in one intrinsic number (paper, figure 2)",
         f"{subject.name}; largest error in the image; scales differ from panel to panel",
     )  # fmt: skip
-    panels = figure.subplots(2, 3)
+    panels = figure.subplots(2, 4)
     rows = numbers["calibration_error"]["intrinsic"]
     labels = list(subject.lenses)
-    for axes, letter, (name, direction) in zip(panels.flat, "abcdef", FIGURE_2, strict=True):
+    for axes, letter, (name, direction) in zip(panels.flat[:-1], "abcdefg", FIGURE_2, strict=True):
         for row in (row for row in rows if row["parameter"] == name):
             index = labels.index(row["lens"])
             axes.plot(
@@ -141,7 +142,9 @@ def _intrinsic_errors(subject: Subject, numbers: dict[str, Any]) -> Any:
         values = {nominal(lens, name) for lens in subject.lenses.values()}
         of = "" if name == "f" else f" of {values.pop():.3g}" if len(values) == 1 else " of its own"
         _quiet(axes, f"error of ${SYMBOLS[name]}$ [%{of}]", f"$e_{direction}$ [px]", f"({letter})  ${SYMBOLS[name]}$")
-    _legend(panels[0, 0], "focal length" if "mm" in labels[0] else "", loc="upper left")
+    handles, _ = panels[0, 2].get_legend_handles_labels()
+    panels[1, 3].set_axis_off()
+    _legend(panels[1, 3], "focal length" if "mm" in labels[0] else "", loc="center left", handles=handles)
     return figure
 
 

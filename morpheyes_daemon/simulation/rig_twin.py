@@ -6,6 +6,7 @@ pictures or, for comparison, written here as the exact one. Servo dynamics belon
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -55,6 +56,7 @@ class RigTwin:
     """A rig built with seeded errors. Each eye rides its own carriage and moves by half of the change."""
 
     def __init__(self, width: int = 640, height: int = 480, seed: int = 0, errors: RigErrors | None = None) -> None:
+        self.seed = seed
         self.errors = RigErrors() if errors is None else errors
         rng = np.random.default_rng([seed, 200])
         self._rotation = self._wander(rng, self.errors.rotation_deg, self.errors.rotation_along_rail_deg)
@@ -79,6 +81,13 @@ class RigTwin:
         k = e.distortion * (np.array([-0.18, 0.06, 4e-4, -3e-4, 0.0]) + spread)
         alpha = e.skew * rng.standard_normal()
         return CameraIntrinsics(640, 480, f, fy, cx, cy, alpha, (k[0], k[1], k[2], k[3], k[4]))
+
+    def bent(self, pitch_rad: float, yaw_rad: float, roll_rad: float = 0.0) -> RigTwin:
+        """Return the same rig after a knock that turned its right eye."""
+        knocked = copy.copy(self)
+        knocked._rotation = self._rotation.copy()
+        knocked._rotation[1, :, 0] += (pitch_rad, yaw_rad, roll_rad)
+        return knocked
 
     def actual_m(self, nominal_m: float) -> float:
         """Return the true distance between the eyes when the servos stand at `nominal_m` on their own scale."""

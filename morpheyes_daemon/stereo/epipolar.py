@@ -12,7 +12,7 @@ vibration is faster than its messages; so each frame has a turn of its own, and 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -85,6 +85,12 @@ class RowFit:
     roll_sigma_rad: float
     residual_px: float
     count: int
+
+
+def levelled(offsets: RowOffsets, pinhole: Pinhole, fit: RowFit) -> RowOffsets:
+    """Return row offsets less what the pitch and roll of `fit` make of them."""
+    turn = np.array([fit.pitch_rad, 0.0, fit.roll_rad])
+    return replace(offsets, dv_px=offsets.dv_px - _turn_columns(offsets, pinhole) @ turn)
 
 
 def row_offsets(left: Image, right: Image, disparity_px: FloatMap) -> RowOffsets:

@@ -28,6 +28,8 @@ FOCAL_LENGTHS_MM = (1.5, 2.0, 3.0, 4.0, 8.0, 16.0)
 """Image, sensor and lenses of the paper's figures 2 and 3."""
 
 INTRINSIC = ("f", "alpha", "k1", "k2", "k3", "k5")
+SWEPT = (*INTRINSIC, "k4")
+"""What figure 2 is drawn for: the table's columns, and k4, which the paper leaves out since it mirrors k3."""
 EXTRINSIC = ("T", "phi", "theta", "psi")
 """The columns of table I. T is T_x; phi, theta, psi turn about x, y, z of the right eye."""
 
