@@ -221,5 +221,6 @@ class MissionFile(Section):
     strategy: str = Field(min_length=1)
     description: str = ""
     world: str = Field("forest", description="world that the simulator flies it in, by name or path")
+    still_scene: bool = Field(True, description="off where much of what is seen may move, such as a swaying wall")
     avoidance: bool = Field(True, description="leave the autopilot's own proximity avoidance switched on")
     parameters: dict[str, Any] = Field(default_factory=dict)

@@ -94,7 +94,9 @@ class Pipeline:
     def __init__(self, config: VehicleConfig, mission: MissionFile, rig: RigModel) -> None:
         self._estimator = DepthEstimator(rig, config.stereo, (config.camera.width_px, config.camera.height_px))
         self._frozen, self._alike, self._scale = FrozenCheck(), AlikeCheck(), ScaleWatch()
-        self._drift = DriftMonitor(self._estimator.rig, DriftLimits(late_s=config.camera.sync_error_ms / 1e3))
+        self._still_scene = mission.still_scene
+        limits = DriftLimits(late_s=config.camera.sync_error_ms / 1e3, watch_yaw=mission.still_scene)
+        self._drift = DriftMonitor(self._estimator.rig, limits)
         self._strategy = build_strategy(mission, config)
         self._T_frd_rig = build_craft(config).T_frd_rig
 
@@ -149,7 +151,7 @@ class Pipeline:
         reasons = {_REASONS.get(fault, Reason.IMAGE_BAD) for fault in found}
         if self._drift.broken:
             reasons.add(Reason.EYES_APART)
-        if self._scale.check(Sight(pair.left, depth, motion)):
+        if self._still_scene and self._scale.check(Sight(pair.left, depth, motion)):
             reasons.add(Reason.DEPTH_SCALE)
         return tuple(sorted(reasons, key=lambda reason: reason.number))
 

@@ -57,6 +57,8 @@ class DriftLimits:
     """How far the measured offset may be from it."""
     baseline_share: float = 0.05
     """A frame whose baseline is not known to this share tells nothing."""
+    watch_yaw: bool = True
+    """A yaw is told from how disparities change with the baseline and on the way: not where much of the scene moves."""
 
 
 class Drift(StrEnum):
@@ -134,7 +136,7 @@ class DriftMonitor:
         rates = row_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, motion)
         self._fit = self._rows.add(offsets, depth.pinhole, *rates)
         findings = [] if moving else self._judge_rows(offsets.median_px, f_px, nominal_m)
-        if not findings and offsets.median_px < 2 * self.limits.rows_px:
+        if self.limits.watch_yaw and not findings and offsets.median_px < 2 * self.limits.rows_px:
             seen = (disparity_of(depth), depth.baseline_m, depth.baseline_sigma_m, depth.pinhole, motion)
             self._yaw.add(Look(depth.t_ns, pair.left, pair.right, *seen, *self._late))
             findings += self._judge_yaw(f_px, nominal_m)
