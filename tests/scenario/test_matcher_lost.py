@@ -13,6 +13,7 @@ from morpheyes_daemon.experiments.plan import make_plan
 from morpheyes_daemon.safety.states import State
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lose", "neutral_within_s"),
     # hung: the depth lease of 0.7 s; killed: told at the next frame, 0.3 s; idle: told at once
