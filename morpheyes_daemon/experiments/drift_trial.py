@@ -39,6 +39,8 @@ _FIRST_PLACE = 12
 _HEIGHT_M = 1.2
 _LATE_SIZE = (320, 240)
 _RATE_HZ = 10.0
+_RUN_UP_M = np.array([4.0, 0.0, 0.0])
+"""The flight begins before the start, so that it ends before the first trees."""
 _RATE_SIGMA_RAD_S, _SPEED_SIGMA_M_S = 0.2, 0.1
 """How far the autopilot's turn rate (vibration) and velocity are off, as in the simulated flights."""
 
@@ -140,7 +142,7 @@ def late_trials(rig: RigModel, seed: int, progress: Progress = silent) -> Iterat
     for done, late_s in enumerate(LATE_S):
         progress("measuring the time between the eyes", done, len(LATE_S))
         watched = _Watched(smaller, RigTwin(*_LATE_SIZE, seed=seed), late_s, seed, None)
-        flight = _Flight(watched.start_ned_m, seed)
+        flight = _Flight(watched.start_ned_m - _RUN_UP_M, seed)
         for number in range(FRAMES):
             t_ns = round(number * S / _RATE_HZ)
             report = watched.look(number, t_ns, _PLACES_M[1], flight.T_ned_frd, flight.reported(t_ns))
@@ -148,9 +150,9 @@ def late_trials(rig: RigModel, seed: int, progress: Progress = silent) -> Iterat
 
 
 class _Flight:
-    """Forwards at 2 m/s, swaying and shaking, as the autopilot reports it: late by nothing, but with its errors."""
+    """Forwards at 4 m/s, swaying and shaking, as the autopilot reports it: late by nothing, but with its errors."""
 
-    _V_NED_M_S = np.array([2.0, 0.3, -0.1])
+    _V_NED_M_S = np.array([4.0, 0.3, -0.1])
     _SWAY_RAD, _SWAY_HZ = np.array([0.05, 0.04, 0.03]), np.array([1.1, 1.7, 0.6])
     _SHAKE_RAD, _SHAKE_HZ = np.array([0.002, 0.002, 0.001]), np.array([17.0, 23.0, 19.0])
 
