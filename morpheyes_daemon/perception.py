@@ -17,6 +17,7 @@ from morpheyes_daemon.calibration.ego_motion import EyeMotion, eye_motion
 from morpheyes_daemon.calibration.scale_watch import ScaleWatch, Sight
 from morpheyes_daemon.clock import stopwatch_s
 from morpheyes_daemon.config import MissionFile, VehicleConfig
+from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.messages import (
     DepthMap,
     DepthSummary,
@@ -64,6 +65,20 @@ class PipelineFactory:
 
     def __call__(self) -> Pipeline:
         return Pipeline(self.config, self.mission, RigModel.load(self.calibration))
+
+
+def fitting_rig(calibration: Path, config: VehicleConfig) -> RigModel:
+    """Return the calibrated rig at the camera's size.
+
+    Raises CalibrationError when it is another camera's, or lacks baselines that the vehicle may be asked for.
+    """
+    rig = RigModel.load(calibration).rescaled(config.camera.width_px, config.camera.height_px)
+    try:
+        for baseline_m in config.baseline_range_m:
+            rig.T_cam0_cam1(baseline_m)
+    except CalibrationError as error:
+        raise CalibrationError(f"{calibration}: {error}") from None
+    return rig
 
 
 def build_craft(config: VehicleConfig) -> Craft:

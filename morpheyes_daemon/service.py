@@ -25,7 +25,7 @@ from morpheyes_daemon.doctor.findings import Severity
 from morpheyes_daemon.doctor.rig import examine_calibration
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.messages import Event
-from morpheyes_daemon.perception import PipelineFactory
+from morpheyes_daemon.perception import PipelineFactory, fitting_rig
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.recorder.flight_log import flight_header, flight_path
 from morpheyes_daemon.recorder.recorder import Recorder
@@ -54,9 +54,7 @@ def calibration_file(config: VehicleConfig) -> Path:
             "calibration is not set: make a file with `morpheyes calibrate solve` and name it in config.yaml, "
             "or give --calibration FILE."
         )
-    rig = RigModel.load(config.calibration).rescaled(config.camera.width_px, config.camera.height_px)
-    for baseline_m in config.baseline_range_m:
-        rig.T_cam0_cam1(baseline_m)
+    fitting_rig(config.calibration, config)
     return config.calibration
 
 

@@ -11,9 +11,9 @@ from morpheyes_daemon.config import VehicleConfig
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.experiments.flight import FlightPlan, sim_config
 from morpheyes_daemon.experiments.stage import Scenario
+from morpheyes_daemon.perception import fitting_rig
 from morpheyes_daemon.shipped import find_mission, load_config, load_mission
 from morpheyes_daemon.simulation.worlds import load_world
-from morpheyes_daemon.stereo.rig import RigModel
 
 DISPARITIES_OF_PX = 640
 """Width of the images that a number of disparities is said for; smaller images search in proportion."""
@@ -49,7 +49,7 @@ def make_plan(
     place = world or file.world
     load_world(place)
     path = calibration_file(calibration, progress)
-    RigModel.load(path).rescaled(vehicle.camera.width_px, vehicle.camera.height_px)
+    fitting_rig(path, vehicle)
     return FlightPlan(
         mission_name=find_mission(mission).stem,
         mission=file,
