@@ -241,7 +241,14 @@ FAULTS: tuple[Fault, ...] = (
     Fault("disk-full", "the log cannot grow", 0.0, _HARMLESS, acts.fill_disk),
     Fault("log-gone", "the log's device goes away", 0.0, _HARMLESS, acts.remove_log_device),
     Fault("sigterm", "systemd stops the daemon", 0.0, _LEFT, acts.terminate),
-    Fault("sigkill", "the daemon is killed and started again", 0.0, _DEAD, acts.die_and_restart, lasts_s=3.0),
+    Fault(
+        "sigkill",
+        "the daemon is killed and started again",
+        0.0,
+        _row(E.STOPS, E.STOPS, E.STOPS, E.READY),
+        acts.die_and_restart,
+        lasts_s=3.0,
+    ),
     Fault("power-cut", "the companion computer loses power", 0.0, _DEAD, acts.die),
 )
 """Every fault; the states of each are the keys of its endings."""

@@ -37,7 +37,24 @@ PER_MUTANT_S = 180
 """Seconds of CPU; a mutant that loops for ever has been noticed."""
 WANTED = 0.95
 
-EQUIVALENT: dict[tuple[str, str, str], str] = {}
+_UNHEARD = "until the switch is heard `on` is False, and hearing it sets the flip"
+_UNSENT = "set before it is read: by the first step, or by the beginning of a release"
+
+EQUIVALENT: dict[tuple[str, str, str], str] = {
+    ("switch", "self._flipped = False", "drop assign"): _UNHEARD,
+    ("switch", "self._flipped = False", "False to True"): _UNHEARD,
+    ("switch", "self._since_ns = self._heard_ns = 0", "0 plus 1"): "a nanosecond after the clock's beginning",
+    ("switch", "self._since_ns = self._heard_ns = 0", "0 minus 1"): "a nanosecond before the clock's beginning",
+    (
+        "switch",
+        "self._flipped = on and self._on is False and t_ns - self._since_ns >= STEADY_NS",
+        "drop term 0",
+    ): "what differs from off is on",
+    ("gate", "self._offer: Sticks | None = None", "drop annassign"): _UNSENT,
+    ("gate", "self._releases = 0", "drop assign"): _UNSENT,
+    ("gate", "self._release_ns = None", "drop assign"): "who lets go of a stick begins a release anew",
+    ("gate", "same_side = (had - neutral) * away > 0", "Gt to GtE"): "zero away is neutral, and zero had adds nothing",
+}
 """(module, line of source, change) -> why no test could notice."""
 
 COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {

@@ -316,6 +316,15 @@ def test_a_release_is_repeated_though_the_loop_is_slow() -> None:
     assert actions == [Action.RELEASE] * (RELEASE_REPEATS - 1) + [Action.SILENT] * 6
 
 
+def test_a_second_release_is_repeated_as_often_as_the_first_though_the_loop_is_slow() -> None:
+    bench = Bench()
+    for _ in range(2):
+        bench.step(State.HOLD)
+        bench.gate.release(State.PILOT, Reason.SWITCH_OFF, bench.now_ns)
+        actions = [bench.step(State.PILOT, dt_ns=2 * S).action for _ in range(RELEASE_REPEATS + 5)]
+        assert actions.count(Action.RELEASE) == RELEASE_REPEATS - 1
+
+
 def test_a_release_ends_though_the_clock_went_back() -> None:
     bench = Bench()
     bench.gate.release(State.PILOT, Reason.SWITCH_OFF, bench.now_ns)

@@ -123,6 +123,14 @@ def test_a_pulse_that_is_none_forgets_what_was_seen(width: float) -> None:
     assert not pilot.puts(ON).asks, "an absent channel is no off"
 
 
+def test_a_pulse_that_is_none_takes_the_flip_back() -> None:
+    pilot = Pilot().puts(OFF).puts(ON)
+    assert pilot.switch.flipped(pilot.now_ns)
+    pilot.switch.hear(pilot.now_ns + 1, 0)
+    assert not pilot.switch.flipped(pilot.now_ns + 1)
+    assert not pilot.asks
+
+
 @pytest.mark.parametrize(
     ("width", "on"),
     [(800, False), (ABOVE, False), (ABOVE + 1, True), (ABOVE + 0.5, True), (2200, True)],
