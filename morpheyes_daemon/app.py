@@ -28,7 +28,7 @@ from morpheyes_daemon.devices.servo import Servo
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.doctor.parameter_rules import examine_parameters
 from morpheyes_daemon.errors import DeviceError
-from morpheyes_daemon.messages import Event, Perception, Track, VehicleState
+from morpheyes_daemon.messages import Event, MissionCommand, Perception, Track, VehicleState
 from morpheyes_daemon.perception import VisionJob, build_strategy
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import Gate, GateOutput, StickLimits
@@ -102,8 +102,10 @@ class Daemon:
         self.hub.on_vehicle(self._on_vehicle)
         topics.track.tap(self._tell_track)
         events.subscribe(self._on_event)
+        topics.command.tap(self._on_command)
         self.hub.parameters.on_change(self._on_parameters)
         self._stops: tuple[str, ...] = ()
+        self._said = ""
         self.supervisor = Supervisor(
             self._tasks(), self.guardian, events, parts.clock, config.safety.supervisor_timeout_s
         )
@@ -240,6 +242,12 @@ class Daemon:
         self.guardian.set_missing(event.reason if lost else None, "servo")
         if lost and self._model is not None:
             self._model.doubt(self._model.at(event.t_ns).target_m, event.t_ns)
+
+    def _on_command(self, command: MissionCommand) -> None:
+        """What a mission says beside its reason, such as the size of the gap it refuses, once."""
+        if command.text and command.reason and command.text != self._said:
+            self.events.publish(Event(command.t_ns, "mission", command.reason, command.text))
+        self._said = command.text
 
     def _on_parameters(self, values: Mapping[str, float]) -> None:
         """The autopilot's own numbers, new: how it flies, where its sticks end, and whether it may be flown."""

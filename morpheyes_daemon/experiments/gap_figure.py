@@ -16,6 +16,7 @@ import numpy as np
 from morpheyes_daemon.config import Footprint, Mount
 from morpheyes_daemon.experiments.campaign import Row
 from morpheyes_daemon.experiments.flight import FlightPlan
+from morpheyes_daemon.experiments.gap_measures import BEFORE_M, BEHIND_M
 from morpheyes_daemon.simulation.gap import GapWorld, gap_truth
 from morpheyes_daemon.simulation.rig_twin import T_frd_rig
 from morpheyes_daemon.simulation.worlds import load_world
@@ -77,7 +78,7 @@ def _draw_side(
     for low, high in ((middle - 2, top), (bottom, middle + 2)):
         axes.fill_between((-0.03, 0.03), low, high, color=WALL_COLOUR)
     _draw_vehicles(axes, sequence, footprint, mount, (0, 2))
-    _frame(axes, (-2.7, 2.7), (middle + 0.8, middle - 0.8))
+    _frame(axes, (-BEFORE_M - 0.2, BEHIND_M + 0.3), (middle + 0.8, middle - 0.8))
 
 
 def _draw_vehicles(

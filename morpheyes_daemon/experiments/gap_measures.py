@@ -21,13 +21,13 @@ from morpheyes_daemon.simulation.gap import GapWorld, drawn_shape
 from morpheyes_daemon.simulation.worlds import load_world
 from morpheyes_daemon.stereo.rectify import Rectifier
 from morpheyes_daemon.stereo.rig import RigModel
-from morpheyes_daemon.strategies.gap import GapPercept
+from morpheyes_daemon.strategies.gap_percept import GapPercept
 from morpheyes_daemon.transforms import Array, inverse, rpy_from_R
 
 BESIDE_M = 0.6
 """The vehicle's centre this near to the wall's plane: it is in the opening."""
 
-SHOWN_M, APART_M = 2.6, 0.42
+BEFORE_M, BEHIND_M, APART_M = 6.8, 2.6, 0.5
 """The stretch of the way that the figure shows, and how far apart the vehicles in it are."""
 
 FRAMES_KEPT = 16
@@ -106,7 +106,7 @@ class GapMeasures:
     def _note(self, T_wall_frd: Array, baseline_m: float) -> None:
         """Keep a pose for the figure wherever the vehicle has come on by `APART_M` towards the wall or behind it."""
         x, y, z = (float(c) for c in T_wall_frd[:3, 3])
-        if abs(x) < SHOWN_M and (not self._sequence or x > self._sequence[-1][0] + APART_M):
+        if -BEFORE_M < x < BEHIND_M and (not self._sequence or x > self._sequence[-1][0] + APART_M):
             pose = (x, y, z, *rpy_from_R(T_wall_frd[:3, :3]), baseline_m)
             self._sequence.append([round(value, 4) for value in pose])
 

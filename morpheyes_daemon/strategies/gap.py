@@ -10,7 +10,6 @@ stretch, where the edges have left the view, is flown on the opening's track.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -21,9 +20,9 @@ from morpheyes_daemon.control.baseline import baseline_for
 from morpheyes_daemon.messages import Intent, Line, MissionCommand
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, StrategyParameters, View
+from morpheyes_daemon.strategies.gap_percept import GapPercept, gap_percept
 from morpheyes_daemon.strategies.gap_track import Motion, PointTrack
-from morpheyes_daemon.strategies.opening import Opening, Place, Silhouette, find_openings, passage
-from morpheyes_daemon.strategies.wall import split
+from morpheyes_daemon.strategies.opening import Opening, Place, Silhouette
 from morpheyes_daemon.transforms import Array, wrap_rad
 
 
@@ -51,25 +50,6 @@ class Phase(StrEnum):
     RUN = "run"
     BEHIND = "behind"
     OVER = "over"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GapPercept:
-    """What one frame shows of wall and openings. `range_m` to the wall along its normal and the normal's heading
-    `yaw_rad` are NaN without a wall; `separation` is Ashman's D of the two depth clusters, `bimodal` whether there
-    are two. `scale_sigma` is the relative doubt of every length, from the baseline's. `origin_ned_m` is the camera.
-    """
-
-    t_ns: int
-    bimodal: bool
-    separation: float
-    range_m: float
-    yaw_rad: float
-    near_limit_m: float
-    scale_sigma: float
-    origin_ned_m: tuple[float, float, float]
-    silhouette: Silhouette
-    openings: tuple[Opening, ...]
 
 
 RANGE_SIGMA: Array = np.array([0.006, 0.006, 0.010])
@@ -142,22 +122,7 @@ class Gap(Strategy):
 
     def perceive(self, view: View) -> GapPercept:
         """Return the openings of the wall ahead."""
-        silhouette = self.silhouette
-        found = split(view.depth)
-        way = passage(found.plane, view.depth.pinhole, view.T_ned_rect) if found else None
-        openings = find_openings(view.depth, found, way, silhouette) if found and way else ()
-        return GapPercept(
-            t_ns=view.depth.t_ns,
-            bimodal=found.bimodal if found else False,
-            separation=found.separation if found else 0.0,
-            range_m=way.range_m if way else math.nan,
-            yaw_rad=way.yaw_rad if way else math.nan,
-            near_limit_m=view.depth.near_limit_m,
-            scale_sigma=view.depth.baseline_sigma_m / view.depth.baseline_m,
-            origin_ned_m=_three(view.T_ned_rect[:3, 3]),
-            silhouette=silhouette,
-            openings=openings,
-        )
+        return gap_percept(view, self.silhouette)
 
     # -- deciding -----------------------------------------------------------------------------------------------
 

@@ -11,7 +11,8 @@ from morpheyes_daemon.control.line import LineKeeper
 from morpheyes_daemon.messages import DepthSummary, Intent, VehicleState
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation
-from morpheyes_daemon.strategies.gap import Gap, GapParameters, GapPercept, Phase
+from morpheyes_daemon.strategies.gap import Gap, GapParameters, Phase
+from morpheyes_daemon.strategies.gap_percept import GapPercept
 from morpheyes_daemon.strategies.opening import Opening, Place
 
 S = 1_000_000_000

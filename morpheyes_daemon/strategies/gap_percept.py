@@ -1,0 +1,50 @@
+"""What the gap mission takes from one frame: the wall ahead, its openings, and how far lengths can be believed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from morpheyes_daemon.strategies.base import View
+from morpheyes_daemon.strategies.opening import Opening, Silhouette, find_openings, passage
+from morpheyes_daemon.strategies.wall import split
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GapPercept:
+    """What one frame shows of wall and openings. `range_m` to the wall along its normal and the normal's heading
+    `yaw_rad` are NaN without a wall; `separation` is Ashman's D of the two depth clusters, `bimodal` whether there
+    are two. `scale_sigma` is the relative doubt of every length, from the baseline's. `origin_ned_m` is the camera.
+    """
+
+    t_ns: int
+    bimodal: bool
+    separation: float
+    range_m: float
+    yaw_rad: float
+    near_limit_m: float
+    scale_sigma: float
+    origin_ned_m: tuple[float, float, float]
+    silhouette: Silhouette
+    openings: tuple[Opening, ...]
+
+
+def gap_percept(view: View, silhouette: Silhouette) -> GapPercept:
+    """Return what a frame shows of a wall with openings; without a wall there are none."""
+    depth, T_ned_rect = view.depth, view.T_ned_rect
+    found = split(depth)
+    way = passage(found.plane, depth.pinhole, T_ned_rect) if found else None
+    openings = find_openings(depth, found, way, silhouette) if found and way else ()
+    north, east, down = (float(x) for x in T_ned_rect[:3, 3])
+    return GapPercept(
+        t_ns=depth.t_ns,
+        bimodal=found.bimodal if found else False,
+        separation=found.separation if found else 0.0,
+        range_m=way.range_m if way else math.nan,
+        yaw_rad=way.yaw_rad if way else math.nan,
+        near_limit_m=depth.near_limit_m,
+        scale_sigma=depth.baseline_sigma_m / depth.baseline_m,
+        origin_ned_m=(north, east, down),
+        silhouette=silhouette,
+        openings=openings,
+    )
