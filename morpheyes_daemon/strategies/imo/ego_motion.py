@@ -113,11 +113,14 @@ def surprise(
 
 
 def _area_share(depth_m: Array) -> Array:
-    """Return (N,) votes between 0 and 1 that grow with depth squared, up to the depth of the farthest fifth."""
+    """Return (N,) votes between 0 and 1 that grow with the fourth power of depth, up to the farthest fifth.
+
+    Squared since what is far stands for more area, and squared again since what is near pulls more pixels per metre.
+    """
     known = depth_m[np.isfinite(depth_m)]
     if not known.size:
         return np.ones_like(depth_m)
-    return np.asarray(np.minimum(1.0, (np.nan_to_num(depth_m) / np.percentile(known, 80)) ** 2))
+    return np.asarray(np.minimum(1.0, (np.nan_to_num(depth_m) / np.percentile(known, 80)) ** 4))
 
 
 def _linearised(T: Array, p_before: Array, uvd_now: Array, now: Frame) -> tuple[Array, Array]:

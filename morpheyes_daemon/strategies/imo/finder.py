@@ -45,6 +45,18 @@ LARGEST_M, SMALLEST_M = 1.5, 0.04
 
 RADIUS_GAIN = 0.15
 
+LIKELY, SURELY = 2.0, 4.0
+"""Sigmas off its former place from which an object goes on moving, and from which one on trial is known to move."""
+
+FEWEST_STANDING, STANDING_SHARE = 4, 0.7
+"""So many corners, and this share of them, make an object one that seems to stand."""
+
+JOINED = 0.5
+"""An object whose surroundings are as far away for more than this share is a piece of something larger."""
+
+UNSURE_SHARE = 0.03
+"""Of the baseline: with a larger sigma of it nothing is concluded."""
+
 MIDDLE_PX = 3.0
 """By how much the middle of an object's pixels wanders without its moving, at 640 px of image width."""
 
@@ -79,6 +91,9 @@ class Finder:
     def step(self, view: View) -> Track | None:
         """Return the track as of this frame, None while nothing confirmed is being followed."""
         frame = Frame.of(view)
+        if frame.baseline_sigma_m > UNSURE_SHARE * frame.baseline_m:
+            self._forget()
+            return None
         best = self._candidates[0] if self._candidates else None
         watched = best.sighting.mask if best and best.sighting else None
         movers = self.tracklets.step(frame, self._own_shift(frame, best), watched)
@@ -94,6 +109,11 @@ class Finder:
             self.tracklets.attend(self._before, frame)
         self._before = frame
         return self._track(best, frame, view.depth) if best and best.confirmed else None
+
+    def _forget(self) -> None:
+        """Start over: while nobody knows how far apart the eyes are, everything seems to move."""
+        self.tracklets = Tracklets()
+        self._before, self._candidates, self.clusters = None, [], []
 
     def _own_shift(self, frame: Frame, best: _Candidate | None) -> Array | None:
         """How far (3,) the object has moved by itself since the frame before, in the present rect axes."""
@@ -128,15 +148,25 @@ class Finder:
             if owner is not None:
                 moved[owner.id] = moved.get(owner.id, 0) + (2 if cluster.count >= MANY else 1)
         for candidate in self._candidates:
-            hit = moved.get(candidate.id, 0) if candidate.sighting is not None else 0
+            hit = moved.get(candidate.id, 0) if _is_apart(candidate) else 0
+            sure = not candidate.confirmed or self._stands(candidate)
+            if not hit and _is_apart(candidate) and self._has_moved(candidate, frame, SURELY if sure else LIKELY):
+                hit = 1
             candidate.moved.append(min(hit, 2))
-            if hit or self._has_moved(candidate, frame):
+            if hit:
                 candidate.moved_ns = frame.t_ns
             if candidate.sighting is not None:
                 candidate.places.append((frame.t_ns, candidate.sighting.p_rect))
             candidate.confirmed |= sum(candidate.moved) >= HITS
 
-    def _has_moved(self, candidate: _Candidate, frame: Frame) -> bool:
+    def _stands(self, candidate: _Candidate) -> bool:
+        """Tell whether the corners on the object agree with a scene that stands."""
+        if candidate.sighting is None:
+            return False
+        standing = self.tracklets.standing(candidate.sighting.mask)
+        return standing.size >= FEWEST_STANDING and float(standing.mean()) > STANDING_SHARE
+
+    def _has_moved(self, candidate: _Candidate, frame: Frame, sigmas: float) -> bool:
         """Tell whether the object is elsewhere than some seconds ago, by the vehicle's refined motion since."""
         if candidate.sighting is None or len(candidate.places) < 3:
             return False
@@ -147,7 +177,7 @@ class Finder:
                 still = frame.project(past.T_now_then[:3, :3] @ p_then + past.T_now_then[:3, 3])
                 wander_px = MIDDLE_PX * frame.scale + SHAPE_SHARE * candidate.radius_m * now[2] / frame.baseline_m
                 allowed = np.array([wander_px, wander_px, 3.0 * REGISTERED_PX + 0.01 * now[2]])
-                if (np.abs(now - still) > 2.0 * allowed).any():
+                if (np.abs(now - still) > sigmas * allowed).any():
                     return True
         return False
 
@@ -172,7 +202,8 @@ class Finder:
 
     def _lives(self, candidate: _Candidate, t_ns: int) -> bool:
         if not candidate.confirmed:
-            return t_ns - candidate.born_ns <= 2 * S and any(candidate.moved)
+            age_ns = t_ns - candidate.born_ns
+            return age_ns <= S or (age_ns <= 2 * S and any(candidate.moved))
         return t_ns - candidate.seen_ns <= self._coast_ns and t_ns - candidate.moved_ns <= STILL_S * S
 
     def _track(self, candidate: _Candidate, frame: Frame, depth: DepthMap) -> Track:
@@ -214,6 +245,11 @@ def _eyes(depth: DepthMap) -> Eyes:
 def _owns(candidate: _Candidate, p_ned: Array, cluster: Cluster) -> bool:
     reach = candidate.radius_m + cluster.radius_m + 3.0 * float(np.sqrt(candidate.filter.P[:3, :3].trace()))
     return float(np.linalg.norm(p_ned - candidate.filter.p_ned_m)) < reach
+
+
+def _is_apart(candidate: _Candidate) -> bool:
+    """Tell whether it is seen, and as a thing by itself."""
+    return candidate.sighting is not None and candidate.sighting.joined < JOINED
 
 
 def _grown(radius_m: float, cluster: Cluster) -> float:

@@ -104,6 +104,12 @@ class Tracklets:
         """Return the vehicle's own motion since the frame of `t_ns`, None when that is forgotten."""
         return next((past for past in self._past if past.t_ns == t_ns), None)
 
+    def standing(self, mask: Mask) -> Mask:
+        """Return, for every corner within `mask` (H, W) that was followed for some frames, whether it stands."""
+        count = len(self.static)
+        old = np.isfinite(self._then[:count, min(2, LAGS - 1), 0])
+        return self.static[old & _inside(mask, self.uvd[:count, :2])]
+
     def replenish(self, frame: Frame, watched: Mask | None) -> None:
         """Look for new corners where there are none; closer together within `watched` (H, W)."""
         free = np.full(frame.left.shape, 255, dtype=np.uint8)

@@ -36,6 +36,9 @@ SMALL_PX = 60.0
 
 STEPS = 6
 
+RING = (1.35, 1.75)
+"""Radii of the ring around an object that should show something else, as multiples of its own."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
@@ -51,7 +54,8 @@ class Expected:
 class Sighting:
     """What one frame says of the object: mask (H, W), middle pixel (2,), depth of the visible face and its point (3,).
 
-    `alike` is the correlation of the patch between the eyes, `whole` whether it lies inside the image.
+    `alike` is the correlation of the patch between the eyes, `whole` whether it lies inside the image, `joined` the
+    share of the ring around it that is as far away: a thing by itself has little of that, a piece of wall much.
     """
 
     mask: Mask
@@ -61,6 +65,7 @@ class Sighting:
     radius_m: float
     alike: float
     whole: bool
+    joined: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +93,7 @@ def sight(frame: Frame, expected: Expected) -> Sighting | None:
     disparity, alike = _registered(frame, patch, mask)
     if alike < ALIKE:
         return None
-    return _sighting(frame, patch, mask, disparity, alike)
+    return _sighting(frame, patch, mask, disparity, alike, expected)
 
 
 def _window(frame: Frame, expected: Expected) -> _Patch | None:
@@ -96,7 +101,7 @@ def _window(frame: Frame, expected: Expected) -> _Patch | None:
     u, v, d = frame.project(expected.p_rect)
     if not np.isfinite(d):
         return None
-    reach = (1.6 * expected.radius_m + 3.0 * expected.across_m) * d / frame.baseline_m + 4.0
+    reach = (1.8 * expected.radius_m + 3.0 * expected.across_m) * d / frame.baseline_m + 4.0
     height, width = frame.left.shape
     left, right = max(0, round(u - reach)), min(width, round(u + reach) + 1)
     top, bottom = max(0, round(v - reach)), min(height, round(v + reach) + 1)
@@ -190,7 +195,9 @@ def _correlation(a: FloatMap, b: FloatMap) -> float:
     return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-6))
 
 
-def _sighting(frame: Frame, patch: _Patch, mask: Mask, disparity: FloatMap, alike: float) -> Sighting | None:
+def _sighting(
+    frame: Frame, patch: _Patch, mask: Mask, disparity: FloatMap, alike: float, expected: Expected
+) -> Sighting | None:
     depth_m = float(frame.bf_m_px / np.median(disparity[mask]))
     if not 0.0 < depth_m < 1e3:
         return None
@@ -201,4 +208,15 @@ def _sighting(frame: Frame, patch: _Patch, mask: Mask, disparity: FloatMap, alik
     edge = bool(whole[0].any() or whole[-1].any() or whole[:, 0].any() or whole[:, -1].any())
     radius_m = float(np.sqrt(mask.sum() / np.pi)) * depth_m / frame.pinhole.f_px
     p_rect = frame.points(np.array([*uv, frame.bf_m_px / depth_m]))
-    return Sighting(whole, uv, depth_m, p_rect, radius_m, alike, not edge)
+    joined = _joined(frame, patch, uv, depth_m, expected.radius_m)
+    return Sighting(whole, uv, depth_m, p_rect, radius_m, alike, not edge, joined)
+
+
+def _joined(frame: Frame, patch: _Patch, middle: Array, depth_m: float, radius_m: float) -> float:
+    """Return the share of the ring around the object whose depth is the object's, within its radius."""
+    ring = _disc(frame, patch, middle, depth_m, RING[1] * radius_m)
+    ring &= ~_disc(frame, patch, middle, depth_m, RING[0] * radius_m)
+    step_m = MATCH_PX * depth_m * depth_m / frame.bf_m_px
+    with np.errstate(invalid="ignore"):
+        same = np.abs(patch.depth_m[ring] - depth_m) < radius_m + step_m
+    return float(same.mean()) if same.size else 1.0
