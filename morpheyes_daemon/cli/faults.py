@@ -47,7 +47,7 @@ def command(
                 typer.echo(f"{row.fault} in {row.state}, seed {row.seed}: {'; '.join(row.complaints)}", err=True)
 
         rows = run_matrix(plan, faults, wanted, jobs, show, known)
-    text = page(rows, f"--seeds {seeds} --size {size} --calibration {calibration}")
+    text = page(rows, f"--seeds {seeds} --size {size} --calibration {calibration}", faults)
     if out is not None:
         out.write_text(text, encoding="utf-8")
     typer.echo(json.dumps([row.as_json() for row in rows], indent=2) if as_json else text)

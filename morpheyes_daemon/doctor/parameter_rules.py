@@ -132,6 +132,12 @@ RULES: tuple[Rule, ...] = (
         "set RC_FS_TIMEOUT to 1", to(RC_FS_TIMEOUT=1.0),
     ),
     Rule(
+        "radio-loss-unseen", Severity.NOTE, equals("RSSI_TYPE", 0),
+        "overrides count as a radio, so while they stream neither autopilot nor daemon sees that the pilot's is gone",
+        "set RSSI_TYPE to 3 where the receiver tells its signal, and its failsafe to put the engage switch off",
+        to(RSSI_TYPE=3.0),
+    ),
+    Rule(
         "battery-failsafe-climbs", Severity.CARE, climbs("BATT_FS_LOW_ACT", (2, 3)),
         "a low battery makes it climb, indoors and under trees too",
         "set BATT_FS_LOW_ACT to 1 (land)", to(BATT_FS_LOW_ACT=1.0),

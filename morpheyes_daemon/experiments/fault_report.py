@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from itertools import groupby
-
-from morpheyes_daemon.experiments.fault_run import Row
+from morpheyes_daemon.experiments.fault_endings import Ending, Fault
+from morpheyes_daemon.experiments.fault_run import STATES, Row
 from morpheyes_daemon.experiments.faults import FAULTS
+from morpheyes_daemon.safety.states import State
 
 _HEAD = (
     "fault",
@@ -21,18 +20,21 @@ _HEAD = (
 )
 
 
-def page(rows: list[Row], settings: str) -> str:
-    """Return docs/faults.md for the rows of a run, sorted by fault and state."""
+def page(rows: list[Row], settings: str, faults: tuple[Fault, ...] = FAULTS) -> str:
+    """Return docs/faults.md: every row of the matrix, with what was measured where it has been flown."""
     passed = sum(row.passed for row in rows)
-    faults = len({row.fault for row in rows})
-    each = Counter((row.fault, row.state) for row in rows).values()
+    places = [(fault, state) for fault in faults for state in STATES if state in fault.endings]
+    flown = {
+        (fault.name, state): [r for r in rows if (r.fault, r.state) == (fault.name, state)] for fault, state in places
+    }
+    each = [len(group) for group in flown.values()]
     seeds = f"{min(each)}" if min(each) == max(each) else f"{min(each)} to {max(each)}"
     return "\n".join(
         (
             "# Fault matrix",
             "",
-            f"{faults} faults in {len(each)} rows, {len(rows)} flights ({seeds} seeds each), {passed} ended as the"
-            f" table says ({passed / len(rows):.1%}), in the lockstep simulator (`morpheyes faults {settings}`).",
+            f"{len(faults)} faults in {len(places)} rows, {len(rows)} flights ({seeds} seeds each), {passed} ended as"
+            f" the table says ({passed / len(rows):.1%}), in the lockstep simulator (`morpheyes faults {settings}`).",
             "",
             "Class A: the daemon lives; from the fault to neutral sticks on the wire it may take 250 ms on top of what"
             " it takes to notice (*allowed* is the sum; for the pilot, 50 ms on top of his message's period). Class B:"
@@ -42,33 +44,30 @@ def page(rows: list[Row], settings: str) -> str:
             "",
             _line(_HEAD),
             _line(("---",) * len(_HEAD)),
-            *(_group(list(group)) for _, group in groupby(rows, key=lambda row: (row.fault, row.state))),
+            *(_group(fault, state, flown[fault.name, state]) for fault, state in places),
             "",
         )
     )
 
 
-def _group(rows: list[Row]) -> str:
-    first = rows[0]
-    what = next(fault.what for fault in FAULTS if fault.name == first.fault)
+def _group(fault: Fault, state: State, rows: list[Row]) -> str:
+    ending = fault.endings[state]
+    named = f"{fault.name}: {fault.what}", fault.kind, state, ending
+    if not rows:
+        return _line((*named, "", "", "", "", "not flown"))
     ended = ", ".join(dict.fromkeys(f"{row.ended} ({row.reason})" for row in rows if row.ended)) or "not started"
-    released = first.ending == "released at once"
+    released = ending is Ending.RELEASES
     times = [row.release_s if released else row.reaction_s for row in rows]
     known = [time for time in times if time is not None]
-    stops = [
-        row for row in rows if row.stop_m is not None and row.ending not in ("flies on", "neutral, then flies on")
-    ]
+    stops = [row for row in rows if row.stop_m is not None and ending not in (Ending.FLIES, Ending.RESUMES)]
     tightest = max(stops, key=lambda row: (row.stop_m or 0.0) - (row.reserved_m or 0.0), default=None)
-    timed = bool(known) and first.kind == "A" and first.ending != "flies on"
+    timed = bool(known) and fault.kind == "A" and ending not in (Ending.FLIES, Ending.HOLDS_IF_IT_MATTERS)
     return _line(
         (
-            f"{first.fault}: {what}" if first.state else first.fault,
-            first.kind,
-            first.state,
-            first.ending,
+            *named,
             ended,
             f"{max(known):.2f} s" if timed else "",
-            f"{first.allowed_s:.2f} s" if timed else "",
+            f"{rows[0].allowed_s:.2f} s" if timed else "",
             _stop(tightest),
             "; ".join(dict.fromkeys(text for row in rows for text in row.complaints)) or "ok",
         )

@@ -7,16 +7,22 @@ import pytest
 from morpheyes_daemon.app import ALARMS
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config import NoServoConfig, SerialServoConfig
+from morpheyes_daemon.doctor.findings import Severity
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.states import State
 from tests.noisy_daemon import NoisyDaemon
+from tests.unit.test_doctor_parameters import BAD
+
+DANGEROUS = [
+    (*changes.popitem(), finding)
+    for changes, finding, severity in ((dict(changes), finding, severity) for changes, finding, severity in BAD)
+    if severity is Severity.STOP and len(changes) == 1
+]
+"""Every single parameter that the doctor says not to fly with, beside what it is called."""
 
 
-@pytest.mark.parametrize(("name", "bad", "finding"), [
-    ("FS_THR_ENABLE", 0.0, "throttle-failsafe-off"),
-    ("RC_OVERRIDE_TIME", -1.0, "override-time-off"),
-])
+@pytest.mark.parametrize(("name", "bad", "finding"), DANGEROUS, ids=[f"{row[0]}={row[1]}" for row in DANGEROUS])
 def test_a_dangerous_parameter_keeps_it_from_standing_by(name: str, bad: float, finding: str) -> None:
     async def life() -> None:
         async with NoisyDaemon(NoServoConfig(backend="none")) as noisy:

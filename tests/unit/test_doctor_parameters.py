@@ -33,6 +33,7 @@ BAD: list[tuple[dict[str, float], str, Severity]] = [
     ({"RC_OVERRIDE_TIME": 3}, "override-time-long", Severity.CARE),
     ({"RC_OVERRIDE_TIME": 3}, "reserve-too-short", Severity.STOP),
     ({"RC_FS_TIMEOUT": 5}, "radio-failsafe-late", Severity.CARE),
+    ({"RSSI_TYPE": 0}, "radio-loss-unseen", Severity.NOTE),
     ({"BATT_FS_LOW_ACT": 2}, "battery-failsafe-climbs", Severity.CARE),
     ({"FS_GCS_ENABLE": 1}, "gcs-failsafe-climbs", Severity.CARE),
     ({"MAV_GCS_SYSID": 250}, "gcs-sysid", Severity.STOP),
@@ -106,7 +107,7 @@ def test_plain_arducopter_may_not_fly() -> None:
 
 
 def test_remedies_use_the_names_and_units_of_the_firmware() -> None:
-    old = ParameterTable({**RECOMMENDED, "LOIT_SPEED": 1250}, old_names=True)
+    old = ParameterTable({**RECOMMENDED, "RSSI_TYPE": 3, "LOIT_SPEED": 1250}, old_names=True)
     old.set("SYSID_MYGCS", 10)
     assert remedies(examine_parameters(old, config())) == {"SYSID_MYGCS": 255, "LOIT_SPEED": 500}
     values = {**old, "LOIT_SPEED_MS": 12.5}

@@ -1,0 +1,152 @@
+"""The fault matrix is complete, its page is up to date, and its rules notice what they are for."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from morpheyes_daemon.errors import UsageError
+from morpheyes_daemon.experiments.fault_endings import Ending, Fault, complaints
+from morpheyes_daemon.experiments.fault_flight import Measured, Sent
+from morpheyes_daemon.experiments.fault_report import page
+from morpheyes_daemon.experiments.fault_run import Row, choose, flights, load_rows, make_row, store_row
+from morpheyes_daemon.experiments.faults import FAULTS
+from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.safety.states import State
+
+PAGE = Path(__file__).parents[2] / "docs/faults.md"
+
+
+def cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_the_page_has_the_rows_of_the_matrix_and_all_are_well() -> None:
+    """Regenerate it with `morpheyes faults --out docs/faults.md` when this fails."""
+    lines = [cells(line) for line in PAGE.read_text().splitlines() if line.startswith("| ")][2:]
+    written = {(line[0].split(":")[0], line[1], line[2], line[3]) for line in lines}
+    wanted = {(f.name, f.kind, state.value, end.value) for f in FAULTS for state, end in f.endings.items()}
+    assert written == wanted
+    assert {line[-1] for line in lines} <= {"ok", "not flown"}
+
+
+def test_the_page_says_how_many_flights_and_that_all_ended_well() -> None:
+    found = re.search(r"(\d+) faults in (\d+) rows, (\d+) flights", PAGE.read_text())
+    assert found is not None
+    assert int(found[1]) == len(FAULTS) >= 40
+    assert int(found[2]) == flights(FAULTS)
+    assert "(100.0%)" in PAGE.read_text()
+
+
+def test_names_are_unique_and_chosen_by_their_beginning() -> None:
+    names = [fault.name for fault in FAULTS]
+    assert len(set(names)) == len(names)
+    assert {fault.name for fault in choose("desync")} == {"desync-5ms", "desync-20ms", "desync-50ms"}
+    assert choose(None) == FAULTS
+    with pytest.raises(UsageError, match="there is no fault 'x'"):
+        choose("x")
+
+
+def fault(ending: Ending, state: State = State.ENGAGED, **more: object) -> Fault:
+    return Fault("name", "what", 0.1, {state: ending}, **more)  # type: ignore[arg-type]
+
+
+SEEN = Measured(
+    state=State.ENGAGED, reason=Reason.ENGAGED, reaction_s=None, quiet_s=None, release_s=None, neutrals=0,
+    sticks_after=0, last=Sent.STICKS, last_s=6.98, stop_m=3.0, stopped=True, reserved_m=4.0, clearance_m=0.5, events=(),
+)  # fmt: skip
+HELD = replace(
+    SEEN, state=State.HOLD, reaction_s=0.2, quiet_s=0.2, neutrals=300, last=Sent.NEUTRAL, reason=Reason.FRAME_STALE
+)
+RELEASED = replace(HELD, state=State.RELEASED, release_s=0.12, last=Sent.RELEASE)
+SILENT = replace(SEEN, state=State.STANDBY, last=None, last_s=None)
+GOOD: dict[Ending, Measured] = {
+    Ending.FLIES: SEEN,
+    Ending.RESUMES: replace(SEEN, reaction_s=0.2, neutrals=20, sticks_after=100),
+    Ending.HOLDS: HELD,
+    Ending.HOLDS_IF_IT_MATTERS: HELD,
+    Ending.RELEASES: RELEASED,
+    Ending.LETS_GO: RELEASED,
+    Ending.READY: SILENT,
+    Ending.UNREADY: replace(SILENT, state=State.PREFLIGHT),
+    Ending.STOPS: HELD,
+}
+BAD: list[tuple[Ending, dict[str, object]]] = [
+    (Ending.FLIES, {"state": State.HOLD}),
+    (Ending.FLIES, {"last": Sent.NEUTRAL}),
+    (Ending.FLIES, {"neutrals": 3}),
+    (Ending.RESUMES, {"reaction_s": 0.4}),
+    (Ending.RESUMES, {"reaction_s": None}),
+    (Ending.RESUMES, {"sticks_after": 0}),
+    (Ending.RESUMES, {"state": State.BRAKING}),
+    (Ending.HOLDS, {"quiet_s": 0.36}),
+    (Ending.HOLDS, {"quiet_s": None}),
+    (Ending.HOLDS, {"state": State.BRAKING}),
+    (Ending.HOLDS, {"last": Sent.RELEASE}),
+    (Ending.HOLDS, {"last_s": 6.5}),
+    (Ending.HOLDS, {"stopped": False}),
+    (Ending.HOLDS_IF_IT_MATTERS, {"state": State.RELEASED}),
+    (Ending.RELEASES, {"release_s": 0.16}),
+    (Ending.RELEASES, {"release_s": None}),
+    (Ending.RELEASES, {"state": State.HOLD}),
+    (Ending.RELEASES, {"sticks_after": 1}),
+    (Ending.RELEASES, {"last": Sent.NEUTRAL}),
+    (Ending.LETS_GO, {"quiet_s": 0.4}),
+    (Ending.LETS_GO, {"neutrals": 0}),
+    (Ending.LETS_GO, {"state": State.HOLD}),
+    (Ending.LETS_GO, {"last": Sent.STICKS}),
+    (Ending.READY, {"state": State.PREFLIGHT}),
+    (Ending.READY, {"neutrals": 1}),
+    (Ending.READY, {"last": Sent.STICKS}),
+    (Ending.UNREADY, {"state": State.STANDBY}),
+    (Ending.UNREADY, {"state": State.ENGAGED}),
+    (Ending.UNREADY, {"last": Sent.NEUTRAL}),
+    (Ending.STOPS, {"stopped": False}),
+    (Ending.STOPS, {"stop_m": 4.1}),
+    (Ending.STOPS, {"sticks_after": 1}),
+    *((ending, {"clearance_m": -0.01}) for ending in (Ending.FLIES, Ending.HOLDS, Ending.LETS_GO, Ending.STOPS)),
+]
+
+
+@pytest.mark.parametrize("ending", GOOD)
+def test_what_ends_as_it_must_is_not_complained_of(ending: Ending) -> None:
+    assert complaints(fault(ending), State.ENGAGED, GOOD[ending]) == []
+
+
+@pytest.mark.parametrize(("ending", "changes"), BAD, ids=str)
+def test_each_rule_notices_what_it_is_for(ending: Ending, changes: dict[str, object]) -> None:
+    assert complaints(fault(ending), State.ENGAGED, replace(GOOD[ending], **changes))  # type: ignore[arg-type]
+
+
+def test_a_daemon_that_starts_where_it_must_refuse_is_complained_of() -> None:
+    assert complaints(fault(Ending.REFUSES), State.ENGAGED, SEEN)
+
+
+def test_what_falls_or_is_the_pilots_may_hit_the_ground() -> None:
+    hit = replace(RELEASED, clearance_m=-0.5)
+    assert complaints(fault(Ending.RELEASES), State.ENGAGED, hit) == []
+    assert complaints(fault(Ending.LETS_GO, falls=True), State.ENGAGED, hit) == []
+
+
+def test_rows_are_kept_and_the_page_shows_the_worst(tmp_path: Path) -> None:
+    one = choose("camera-stall")[0]
+    rows = [
+        make_row(one, State.ENGAGED, seed, replace(HELD, quiet_s=0.5 + seed / 10, reserved_m=math.inf), ())
+        for seed in (0, 1)
+    ]
+    for row in rows:
+        store_row(tmp_path / "rows.jsonl", row)
+    assert load_rows(tmp_path / "rows.jsonl") == rows
+    assert load_rows(tmp_path / "none.jsonl") == []
+    assert all(isinstance(row, Row) and row.passed for row in rows)
+    text = page(rows, "--seeds 0-1", (one,))
+    assert "1 faults in 4 rows, 2 flights (0 to 2 seeds each), 2 ended as the table says (100.0%)" in text
+    assert "0.60 s" in text
+    assert text.count("not flown") == 3
+    rows.append(make_row(choose("camera-stall")[0], State.HOLD, 0, HELD, ("still moves",)))
+    assert "3 flights (0 to 2 seeds each), 2 ended" in page(rows, "", (one,))
+    assert "still moves" in page(rows, "", (one,))
