@@ -41,6 +41,7 @@ class Solved:
             "epipolar_median_px": round(self.held_out.median_px, 4),
             "epipolar_p95_px": round(self.held_out.p95_px, 4),
             "leave_one_out": [_left_out_row(one) for one in self.left_out],
+            "leave_one_out_ratio": left_out_ratio(self.left_out),
             "outliers": [outlier.name for outlier in calibration.outliers],
             "verdict": self.verdict.text,
             "retake": list(self.verdict.retake),
@@ -130,6 +131,14 @@ def _by_cell(solved: Solved) -> list[list[float | None]]:
 
 def _median(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
     return round(float(np.median(values)), 4) if len(values) else None
+
+
+def left_out_ratio(left_out: list[LeftOutBaseline]) -> float | None:
+    """Return the row error of the left-out baselines over that of the full solve on the same boards, both averaged."""
+    if not left_out:
+        return None
+    full = sum(one.full_epipolar_median_px for one in left_out)
+    return round(sum(one.epipolar_median_px for one in left_out) / full, 3)
 
 
 def _left_out_row(one: LeftOutBaseline) -> dict[str, float]:

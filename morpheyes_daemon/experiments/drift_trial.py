@@ -37,7 +37,6 @@ _PLACES_M = (0.1, 0.3)
 _FIRST_PLACE = 12
 """Frames at the first baseline; the rest is at the second."""
 _HEIGHT_M = 1.2
-_LATE_SIZE = (320, 240)
 _RATE_HZ = 10.0
 _RUN_UP_M = np.array([4.0, 0.0, 0.0])
 """The flight begins before the start, so that it ends before the first trees."""
@@ -138,10 +137,9 @@ def drift_trial(rig: RigModel, seed: int, bent_deg: float = BENT_DEG, progress: 
 
 def late_trials(rig: RigModel, seed: int, progress: Progress = silent) -> Iterator[LateTrial]:
     """Fly 20 frames with each time of `LATE_S` between the eyes, 2 ms declared, and yield what was measured."""
-    smaller = rig.rescaled(*_LATE_SIZE)
     for done, late_s in enumerate(LATE_S):
         progress("measuring the time between the eyes", done, len(LATE_S))
-        watched = _Watched(smaller, RigTwin(*_LATE_SIZE, seed=seed), late_s, seed, None)
+        watched = _Watched(rig, RigTwin(*rig.size, seed=seed), late_s, seed, None)
         flight = _Flight(watched.start_ned_m - _RUN_UP_M, seed)
         for number in range(FRAMES):
             t_ns = round(number * S / _RATE_HZ)
