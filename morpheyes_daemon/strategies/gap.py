@@ -13,33 +13,17 @@ import math
 from enum import StrEnum
 
 import numpy as np
-from pydantic import Field
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.control.baseline import baseline_for
 from morpheyes_daemon.messages import Intent, Line, MissionCommand
 from morpheyes_daemon.reasons import Reason
-from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, StrategyParameters, View
+from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, View
+from morpheyes_daemon.strategies.gap_parameters import GapParameters
 from morpheyes_daemon.strategies.gap_percept import GapPercept, gap_percept
 from morpheyes_daemon.strategies.gap_track import Motion, PointTrack
 from morpheyes_daemon.strategies.opening import Opening, Place, Silhouette
 from morpheyes_daemon.transforms import Array, wrap_rad
-
-
-class GapParameters(StrategyParameters):
-    """What `parameters:` of a gap mission may say."""
-
-    speed_m_s: float = Field(2.9, gt=0.2, le=6, description="through the opening; the governor is the real bound")
-    approach_m_s: float = Field(1.2, gt=0.1, le=3, description="to the stand-off")
-    stand_off_m: float = Field(4.0, gt=1.5, le=10, description="from here it measures, and takes its run")
-    margin_m: float = Field(0.0, ge=0, le=0.5, description="measured room around the silhouette that it must have")
-    lean_deg: float = Field(12.0, ge=0, le=30, description="of the vehicle when crossing, for its silhouette")
-    baseline_gain: float = Field(0.05, gt=0, le=1, description="K of b = K median(Z_C)")
-    confirm_frames: int = Field(5, ge=2, le=50, description="frames in a row that must show that it fits")
-    off_line_m: float = Field(0.05, gt=0.005, le=0.5, description="how near to the line it must be to take its run")
-    look_s: float = Field(12.0, gt=1, le=120, description="without an opening for so long it refuses")
-    watch_s: float = Field(9.0, gt=2, le=60, description="a moving opening is watched for so long before the run")
-    behind_m: float = Field(0.6, gt=0.2, le=10, description="past the wall by this it stops")
 
 
 class Phase(StrEnum):
@@ -63,6 +47,12 @@ SURE_SCALE = 0.02
 
 SAME_M = 0.5
 """An opening seen this near to where the tracked one should be is the same."""
+
+ALONG_SHARE = 0.4
+"""Of what counts across, along the way: range is seen worse."""
+
+FORGOTTEN_S = 2.0
+"""Not seen for so long before the run: what is seen then is another opening."""
 
 LOST_S = 0.7
 """Not seen for so long on the run, while there is room to stop: the run is broken off."""
@@ -111,8 +101,6 @@ class Gap(Strategy):
         self._seen_ns = 0
         self._seq = 0
 
-    # -- looking ------------------------------------------------------------------------------------------------
-
     @property
     def silhouette(self) -> Silhouette:
         """The vehicle along its way, in crossing attitude at the smallest baseline."""
@@ -123,8 +111,6 @@ class Gap(Strategy):
     def perceive(self, view: View) -> GapPercept:
         """Return the openings of the wall ahead."""
         return gap_percept(view, self.silhouette)
-
-    # -- deciding -----------------------------------------------------------------------------------------------
 
     def decide(self, observation: Observation) -> MissionCommand:
         """Return line, speed and baseline until the next frame."""
@@ -153,9 +139,12 @@ class Gap(Strategy):
         if self._phase in (Phase.BEHIND, Phase.OVER):
             return
         whole = [opening for opening in percept.openings if not opening.cut]
-        if not whole:
+        sure = percept.scale_sigma < SURE_SCALE
+        if not whole or not (sure or self._track.count):
             return
-        found = self._same(whole, percept.t_ns) if self._track.count else max(whole, key=_room)
+        if self._phase is not Phase.RUN and percept.t_ns - self._seen_ns > FORGOTTEN_S * S:
+            self._track, self._room = PointTrack(self._yaw_rad), []
+        found = self._same(whole, percept.t_ns, sure) if self._track.count else max(whole, key=lambda opening: opening.places[0].clearance_m)
         if found is None:
             return
         opening, place = (found, found.places[0]) if isinstance(found, Opening) else found
@@ -168,7 +157,7 @@ class Gap(Strategy):
             heading = np.array([0.0, wrap_rad(percept.yaw_rad - self._yaw_rad), 0.0])
             self._yaw.see(percept.t_ns, heading, YAW_SIGMA)
         measures = self._phase is Phase.APPROACH and opening.z_m < 1.2 * self.parameters.stand_off_m
-        if measures and percept.scale_sigma < SURE_SCALE:
+        if measures and sure:
             self._room = [*self._room[-30:], place.clearance_m]
         if self._phase in (Phase.APPROACH, Phase.CLOSE) and self._track.spread_m(3.0) > MOVES_M:
             self._track.moves = self._yaw.moves = True
@@ -181,11 +170,17 @@ class Gap(Strategy):
         known = float((self._track.at(percept.t_ns).p_m - origin) @ ahead)
         return np.asarray(origin + (p_ned_m - origin) * known / max(0.1, float((p_ned_m - origin) @ ahead)))
 
-    def _same(self, openings: list[Opening], t_ns: int) -> tuple[Opening, Place] | None:
+    def _same(self, openings: list[Opening], t_ns: int, sure: bool) -> tuple[Opening, Place] | None:
         """Return which of the openings, and which place in it, is the tracked one."""
-        at = self._track.at(t_ns).p_m
+        at, ahead = self._track.at(t_ns).p_m, self._ahead()
+
+        def off(place: Place) -> float:
+            apart = np.array(place.p_ned_m) - at
+            along_m = float(apart @ ahead)
+            return math.hypot(float(np.linalg.norm(apart - along_m * ahead)), ALONG_SHARE * along_m if sure else 0.0)
+
         near = [
-            (float(np.linalg.norm((np.array(place.p_ned_m) - at)[1:])), opening, place)
+            (off(place), opening, place)
             for opening in openings
             for place in self._candidates(opening)
         ]
@@ -202,11 +197,11 @@ class Gap(Strategy):
         """Fly to the stand-off, set on the opening, confirm that the vehicle fits; then take the run or refuse."""
         parameters, vehicle, now_ns = self.parameters, observation.vehicle, observation.now_ns
         percept: GapPercept = observation.percept
-        if self._chosen is None or now_ns - self._seen_ns > 2 * S:
+        if not self._track.count or now_ns - self._seen_ns > FORGOTTEN_S * S:
             if observation.engaged and now_ns - max(self._settled_ns, self._seen_ns) > parameters.look_s * S:
                 why = "no opening in the wall" if percept.bimodal else "the depth has no two clusters"
                 return self._command(observation, Intent.REFUSE, Reason.MISSION_REFUSED, text=why)
-            return self._command(observation, Intent.STOP, Reason.NO_FREE_PATH)
+            return self._nearer(observation)
         opening, ahead = self._track.at(now_ns), self._ahead()
         range_m = float((opening.p_m - np.array(vehicle.p_ned_m)) @ ahead)
         start = opening.p_m - parameters.stand_off_m * ahead
@@ -220,6 +215,15 @@ class Gap(Strategy):
                 self._track.near()
                 return self._run(observation)
         return self._hold(observation, opening, start, ahead, range_m)
+
+    def _nearer(self, observation: Observation) -> MissionCommand:
+        """Go on to the stand-off before a wall in which no opening is seen yet: from there a small one is."""
+        percept: GapPercept = observation.percept
+        if not (observation.engaged and math.isfinite(percept.range_m) and percept.scale_sigma < SURE_SCALE):
+            return self._command(observation, Intent.STOP, Reason.NO_FREE_PATH, z_m=percept.range_m)
+        here, ahead = np.array(observation.vehicle.p_ned_m), self._ahead()
+        place = here + max(0.0, percept.range_m - self.parameters.stand_off_m) * ahead
+        return self._hold(observation, Motion(place, np.zeros(3), np.zeros(3), 0.0), place, ahead, percept.range_m)
 
     def _hold(
         self, observation: Observation, opening: Motion, start: Array, ahead: Array, range_m: float
@@ -355,7 +359,10 @@ class Gap(Strategy):
         z_c_m = z_m if math.isnan(contour_m) else contour_m
         low, high = self.craft.baseline_range_m
         following = self._phase is Phase.APPROACH
-        baseline_m = baseline_for(z_c_m, self.parameters.baseline_gain, (low, high)) if following else low
+        wanted_m = baseline_for(z_c_m, self.parameters.baseline_gain, (low, high))
+        if math.isnan(z_c_m):
+            wanted_m = observation.baseline_m  # eyes that go to and fro lose their scale
+        baseline_m = wanted_m if following else low
         return MissionCommand(
             seq=self._seq,
             t_ns=observation.now_ns,
@@ -386,10 +393,6 @@ class Gap(Strategy):
             "opening_height_m": chosen.height_m,
             "beyond_m": self._beyond_m,
         }
-
-
-def _room(opening: Opening) -> float:
-    return opening.places[0].clearance_m
 
 
 def _three(vector: Array) -> tuple[float, float, float]:

@@ -11,7 +11,8 @@ from morpheyes_daemon.control.line import LineKeeper
 from morpheyes_daemon.messages import DepthSummary, Intent, VehicleState
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation
-from morpheyes_daemon.strategies.gap import Gap, GapParameters, Phase
+from morpheyes_daemon.strategies.gap import Gap, Phase
+from morpheyes_daemon.strategies.gap_parameters import GapParameters
 from morpheyes_daemon.strategies.gap_percept import GapPercept
 from morpheyes_daemon.strategies.opening import Opening, Place
 
@@ -127,10 +128,17 @@ def test_of_several_openings_it_takes_the_one_with_most_room():
 
 
 def test_without_an_opening_it_refuses_after_a_look():
-    course = Course(lambda range_m: [], look_s=5.0)
+    course = Course(lambda range_m: [], look_s=12.0)
     last = course.fly(20.0)
     assert (last.intent, last.text) == (Intent.REFUSE, "no opening in the wall")
-    assert course.vehicle.p_ned_m[0] == 0.0
+    assert WALL_M - course.vehicle.p_ned_m[0] == pytest.approx(GapParameters().stand_off_m, abs=0.3)
+
+
+def test_nothing_is_flown_at_before_the_pilot_engages():
+    course = Course(seen_from_afar)
+    for _ in range(20):
+        course.step(engaged=False)
+    assert set(course.phases) == {Phase.APPROACH}
 
 
 def test_an_opening_lost_at_the_start_of_the_run_breaks_it_off():
