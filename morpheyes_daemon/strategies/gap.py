@@ -144,7 +144,8 @@ class Gap(Strategy):
             return
         if self._phase is not Phase.RUN and percept.t_ns - self._seen_ns > FORGOTTEN_S * S:
             self._track, self._room = PointTrack(self._yaw_rad), []
-        found = self._same(whole, percept.t_ns, sure) if self._track.count else max(whole, key=lambda opening: opening.places[0].clearance_m)
+        roomiest = max(whole, key=lambda opening: opening.places[0].clearance_m)
+        found = self._same(whole, percept.t_ns, sure) if self._track.count else roomiest
         if found is None:
             return
         opening, place = (found, found.places[0]) if isinstance(found, Opening) else found
