@@ -57,6 +57,10 @@ class DriftLimits:
     """How far the measured offset may be from it."""
     baseline_share: float = 0.05
     """A frame whose baseline is not known to this share tells nothing."""
+    yaw_pairs: int = 2
+    """Pairs of frames, each of other seconds, that must agree before a yaw is called too large to be a drift."""
+    steady_s: float = 0.5
+    """Frames farther apart say nothing of the yaw: too much happens in between."""
     watch_yaw: bool = True
     """A yaw is told from how disparities change with the baseline and on the way: not where much of the scene moves."""
 
@@ -69,6 +73,7 @@ class Drift(StrEnum):
     TURNED = "turned"
     YAW = "yaw"
     LATE = "late"
+    DOUBTED = "doubted"
     BROKEN = "broken"
 
 
@@ -118,6 +123,7 @@ class DriftMonitor:
         self._told: set[Drift] = set()
         self._fit: RowFit | None = None
         self._agreeing = 0
+        self._last_ns = 0
         self.broken = False
         """An eye has turned farther than any drift: depth is worth nothing until a new calibration."""
         self._rows, self._yaw = RowWatch(_MEMORY, self.limits.late_s), YawWatch(uncertain)
@@ -136,7 +142,9 @@ class DriftMonitor:
         rates = row_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, motion)
         self._fit = self._rows.add(offsets, depth.pinhole, *rates)
         findings = [] if moving else self._judge_rows(offsets.median_px, f_px, nominal_m)
-        if self.limits.watch_yaw and not findings and offsets.median_px < 2 * self.limits.rows_px:
+        steady = depth.t_ns - self._last_ns <= self.limits.steady_s * 1e9
+        self._last_ns = depth.t_ns
+        if self.limits.watch_yaw and steady and not findings and offsets.median_px < 2 * self.limits.rows_px:
             seen = (disparity_of(depth), depth.baseline_m, depth.baseline_sigma_m, depth.pinhole, motion)
             self._yaw.add(Look(depth.t_ns, pair.left, pair.right, *seen, *self._late))
             findings += self._judge_yaw(f_px, nominal_m)
@@ -220,6 +228,8 @@ class DriftMonitor:
         total = turn_between(self.rig, nominal_m, R_from_rotvec(turn_rect_rad)) @ self._turned
         angle = math.acos(max(-1.0, min(1.0, (float(np.trace(total)) - 1.0) / 2.0)))
         if angle > self.limits.largest_rad:
+            if what is Drift.YAW and self._yaw.pairs < self.limits.yaw_pairs:
+                return self._once(Drift.DOUBTED, f"{text}: more than a drift, if it is confirmed")
             self._agreeing, self.broken = 0, True
             return self._once(Drift.BROKEN, f"{text}: too far for a drift; land and calibrate again")
         self.rig, self._turned = turned, total

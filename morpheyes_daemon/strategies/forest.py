@@ -59,6 +59,9 @@ class ForestParameters(StrategyParameters):
 ASTRAY_RAD = math.radians(75.0)
 """A goal further off the nose than this lies behind."""
 
+RESPONSE_S = 0.7
+"""Time constant with which Loiter takes up a velocity."""
+
 FIRST_DETOUR_M = 4.0
 """Flown away from the goal before turning back for the first time."""
 
@@ -233,6 +236,8 @@ class Forest(Strategy):
         wanted = min(self.parameters.speed_m_s, 0.3 + 0.8 * distance_m)
         facing = math.cos(min(math.pi / 2, 1.5 * abs(wrap_rad(heading - vehicle.yaw_rad))))
         wanted *= max(0.15, facing)
+        way = np.array([math.cos(command_rad), math.sin(command_rad)])
+        wanted *= self._turnable(obstacles, np.array([vx, vy]), wanted * way, slim)
         self._heading_rad = heading
         self._follow(z_close, dt_s)
         return self._command(
@@ -245,6 +250,25 @@ class Forest(Strategy):
             z_close,
             {"heading_rad": heading, "drift_m": drift, "half_width_m": half_width},
         )
+
+    def _turnable(self, obstacles: Floats, v_m_s: Floats, wanted_m_s: Floats, half_width_m: float) -> float:
+        """Return which share of the wanted velocity keeps clear on the way to the next decision.
+
+        A velocity changes over a second, so the way to a new heading bends: with frames far apart it leaves the
+        corridors of both the old course and the new one.
+        """
+        t = np.linspace(0.0, 1.0, 12) * 2.0 * self.craft.frame_period_s
+        gone = RESPONSE_S * (1.0 - np.exp(-t / RESPONSE_S))
+        best, best_room = 0.0, -math.inf
+        for share in (1.0, 0.7, 0.45, 0.25, 0.0):
+            v = share * wanted_m_s
+            path = np.outer(t, v) + np.outer(gone, v_m_s - v)
+            room = float(np.linalg.norm(obstacles[:, None, :] - path[None], axis=2).min(initial=math.inf))
+            if room > half_width_m:
+                return share
+            if room > best_room + 0.02:
+                best, best_room = share, room
+        return best
 
     def _astray(self, off_goal_rad: float, distance_m: float, vehicle: VehicleState, dt_s: float) -> bool:
         """Tell whether it is time to turn back towards a goal that lies behind.
