@@ -148,16 +148,26 @@ class Finder:
             if owner is not None:
                 moved[owner.id] = moved.get(owner.id, 0) + (2 if cluster.count >= MANY else 1)
         for candidate in self._candidates:
-            hit = moved.get(candidate.id, 0) if _is_apart(candidate) else 0
-            sure = not candidate.confirmed or self._stands(candidate)
-            if not hit and _is_apart(candidate) and self._has_moved(candidate, frame, SURELY if sure else LIKELY):
-                hit = 1
+            hit = self._evidence(candidate, frame, moved.get(candidate.id, 0))
             candidate.moved.append(min(hit, 2))
             if hit:
                 candidate.moved_ns = frame.t_ns
             if candidate.sighting is not None:
                 candidate.places.append((frame.t_ns, candidate.sighting.p_rect))
             candidate.confirmed |= sum(candidate.moved) >= HITS
+
+    def _evidence(self, candidate: _Candidate, frame: Frame, clustered: int) -> int:
+        """Return how clearly a candidate moves in this frame, in frames: 0 to 2.
+
+        On trial nothing counts while its corners stand: the middle of a column's pixels wanders along it.
+        """
+        if not _is_apart(candidate):
+            return 0
+        stands = self._stands(candidate)
+        if stands and not candidate.confirmed:
+            return 0
+        sigmas = LIKELY if candidate.confirmed and not stands else SURELY
+        return clustered or int(self._has_moved(candidate, frame, sigmas))
 
     def _stands(self, candidate: _Candidate) -> bool:
         """Tell whether the corners on the object agree with a scene that stands."""
