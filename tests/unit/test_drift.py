@@ -4,14 +4,18 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from morpheyes_daemon.calibration.drift import turned_rig
+from morpheyes_daemon.calibration.drift import Drift, DriftMonitor, turned_rig
 from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates
 from morpheyes_daemon.calibration.rectified import StereoGeometry, infinity_px
 from morpheyes_daemon.calibration.yaw_watch import leverage
-from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.messages import BaselineEstimate, Pinhole, StereoFrame
+from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
+from morpheyes_daemon.stereo.epipolar import row_offsets
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import R_from_rotvec, inverse, pose
+from tests.panels import Panel, crooked_rig, raw_pair
 from tests.synthetic_rig import CAM0, CAM1, TEN_M, true_geometry, true_pose
 
 
@@ -51,3 +55,51 @@ def test_rates_of_the_right_eye_are_those_of_moving_the_rig() -> None:
 def test_a_wider_change_of_baseline_tells_more() -> None:
     assert leverage(0.1, 0.3) > leverage(0.1, 0.2) > leverage(0.2, 0.3) > leverage(0.2, 0.2) == 0.0
     assert true_geometry(0.2).length_m == pytest.approx(0.2, abs=0.01)
+
+
+WORLD = [Panel(5.0, slope_x=0.3), Panel(2.5, x_m=(-0.3, 0.6), y_m=(-0.5, 0.3), seed=3)]
+SMALL = crooked_rig(320, 240)
+
+
+def watched(pitch_deg: float, panels: list[Panel], frames: int, moving: bool = False) -> tuple[DriftMonitor, list[Drift]]:
+    """A monitor that has seen the same still pair for so many frames, the right eye having turned since."""
+    monitor = DriftMonitor(turned_rig(SMALL, -np.radians([pitch_deg, 0.0, 0.0]), 0.2))
+    estimator = DepthEstimator(monitor.rig)
+    at = BaselineEstimate(0, 0.2, 0.2, 1e-4, moving)
+    frame = StereoFrame(0, 0, *raw_pair(panels, SMALL, 0.2, noise=1.5), at)
+    pair = estimator.rectified(frame)
+    depth = estimator.depth(frame, pair)
+    offsets = row_offsets(pair.left, pair.right, disparity_of(depth))
+    still = EyeMotion.still(np.eye(4))
+    reports = [monitor.update(pair, depth, offsets, moving, still) for _ in range(frames)]
+    return monitor, [finding.what for report in reports for finding in report.findings]
+
+
+def test_a_pitched_eye_is_told_at_once_and_corrected_ten_frames_later() -> None:
+    monitor, told = watched(0.15, WORLD, frames=11)
+    assert told == [Drift.ROWS, Drift.TURNED]
+    turned_back = inverse(SMALL.T_cam0_cam1(0.2)) @ monitor.rig.T_cam0_cam1(0.2)
+    left_over = np.degrees(Rotation.from_matrix(turned_back[:3, :3]).magnitude())
+    assert left_over < 0.02, "a tenth of a pixel"
+
+
+@pytest.mark.parametrize(
+    ("pitch_deg", "panels", "moving"),
+    [(0.0, WORLD, False), (0.15, [Panel(3.0, contrast=0.01)], False)],
+    ids=["a good rig", "no texture"],
+)
+def test_nothing_is_done_without_evidence(pitch_deg: float, panels: list[Panel], moving: bool) -> None:
+    monitor, told = watched(pitch_deg, panels, frames=15, moving=moving)
+    assert told == []
+    assert not monitor.broken
+
+
+def test_nothing_is_corrected_while_the_servo_moves() -> None:
+    _, told = watched(0.15, WORLD, frames=15, moving=True)
+    assert Drift.TURNED not in told
+
+
+def test_an_eye_that_turned_far_is_broken_and_not_mended() -> None:
+    monitor, told = watched(0.3, WORLD, frames=15)
+    assert told == [Drift.ROWS, Drift.BROKEN]
+    assert monitor.broken
