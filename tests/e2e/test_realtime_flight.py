@@ -34,6 +34,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 CRUISE_M_S = 1.0
 FLY_LIMIT_S = 120.0
 AFTER_S = 8.0
+STANDOFF_M = 0.15
+"""The governor never plans to come nearer to anything than this."""
 ESTIMATE_M = 0.5
 """How far the autopilot's own position may be off over such a stop, and the wind may push."""
 
@@ -101,11 +103,10 @@ async def test_a_daemon_cut_off_leaves_a_vehicle_that_stops_within_the_reserve(
 ) -> None:
     async with cruising(plan, tmp_path, autopilot) as flight:
         daemon = flight.daemon
-        before, model = daemon.topics.vehicle.get(), daemon.stopping
+        before, governed = daemon.topics.vehicle.get(), daemon.topics.governed.get()
         assert before is not None
-        assert model is not None
-        v = speed(flight)
-        reserve_m = v * daemon.config.safety.dead_daemon_s + model.stopping_distance_m(v, -before.p_ned_m[2])
+        assert governed is not None
+        reserve_m = min(governed.clear_m, governed.trust_m) - STANDOFF_M
         daemon.hub.transmitter.link = None  # nothing of ours goes out any more; what comes in still does
         farthest_m = 0.0
         clock = running_clock()
