@@ -10,8 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from morpheyes_daemon.config import StereoConfig
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.experiments.campaign import SETTINGS, Row
+from morpheyes_daemon.experiments.plan import DISPARITIES_OF_PX
+from morpheyes_daemon.experiments.stage import WIND_M_S
 
 BEGIN = "<!-- missions: written by `morpheyes results` -->"
 END = "<!-- end of missions -->"
@@ -75,8 +78,8 @@ def missions_part(found: Sequence[tuple[Row, str]]) -> str:
 def _conditions(settings: Row) -> str:
     return (
         f"World `{settings['world']}`, {settings['image_size']}, {settings['rate_hz']:g} Hz with "
-        f"{settings['latency_ms']:g} ms of latency, {settings['disparities_fraction'] * 640:.0f} disparities at 640 px, "
-        f"wind {settings['wind_m_s']:g} m/s:"
+        f"{settings['latency_ms']:g} ms of latency, {_disparities(settings['disparities_fraction'])} disparities at "
+        f"{DISPARITIES_OF_PX} px, wind {settings['wind_m_s']:g} m/s:"
     )
 
 
@@ -85,14 +88,15 @@ def _command(settings: Row) -> str:
     options = [f"--seeds {low}-{high}", f"--size {settings['image_size']}"]
     if settings["baselines"] != ["variable"]:
         options.append(f"--baselines {','.join(settings['baselines'])}")
-    usual: dict[str, Any] = {"rate_hz": 5.0, "latency_ms": 100.0, "wind_m_s": 2.0}
+    usual: dict[str, Any] = {"rate_hz": 5.0, "latency_ms": StereoConfig().latency_ms, "wind_m_s": WIND_M_S}
     options += [f"--{key.replace('_', '-')} {settings[key]:g}" for key, value in usual.items() if settings[key] != value]
-    if round(settings["disparities_fraction"] * 640) != USUAL_DISPARITIES:
-        options.append(f"--disparities {settings['disparities_fraction'] * 640:.0f}")
+    if settings["disparities_fraction"] != StereoConfig().disparities_fraction:
+        options.append(f"--disparities {_disparities(settings['disparities_fraction'])}")
     return " ".join([f"morpheyes experiment {settings['mission']}", *options, f"--world {settings['world']}"])
 
 
-USUAL_DISPARITIES = 160
+def _disparities(fraction: float) -> int:
+    return round(fraction * DISPARITIES_OF_PX)
 
 
 def _read(folder: Path) -> tuple[Row, str]:
