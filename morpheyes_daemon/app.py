@@ -220,7 +220,9 @@ class Daemon:
             table.append(
                 Task(
                     "baseline",
-                    lambda pulse: baseline(parts.servo, model, planner, first_m, topics, clock, pulse),
+                    lambda pulse: baseline(
+                        parts.servo, model, planner, first_m, topics, clock, self._heed_baseline, pulse
+                    ),
                     Reason.SERVO_LOST,
                 )
             )
@@ -242,6 +244,10 @@ class Daemon:
         self.guardian.set_missing(event.reason if lost else None, "servo")
         if lost and self._model is not None:
             self._model.doubt(self._model.at(event.t_ns).target_m, event.t_ns)
+
+    def _heed_baseline(self, known: bool) -> None:
+        """Until the eyes are known to be somewhere, neither depth nor the checks of their pictures mean anything."""
+        self.guardian.set_missing(None if known else Reason.BASELINE_UNKNOWN, "baseline")
 
     def _on_command(self, command: MissionCommand) -> None:
         """What a mission says beside its reason, such as the size of the gap it refuses, once."""

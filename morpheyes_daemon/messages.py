@@ -27,6 +27,10 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
     return array
 
 
+KNOWN_SHARE = 0.05
+"""Share of a baseline that its sigma may be: beyond it depth has no scale, and rows mean nothing."""
+
+
 @dataclass(frozen=True, slots=True)
 class BaselineEstimate:
     """The modelled distance between the eyes at `t_ns`; the servo has no feedback, so it carries a sigma."""
@@ -36,6 +40,11 @@ class BaselineEstimate:
     baseline_m: float
     sigma_m: float
     moving: bool
+
+    @property
+    def known(self) -> bool:
+        """True when sigma is a small share of the baseline."""
+        return self.sigma_m < KNOWN_SHARE * self.baseline_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -160,7 +160,7 @@ class Pipeline:
         found = exposure_faults(pair.left, pair.right)
         found |= matching_faults(pair.left, pair.right, depth.valid_fraction)
         left_over = self._drift.unexplained(offsets, depth)
-        found |= self._alike.check(pair.left, left_over, depth.pinhole.f_px, self._drift.knows(depth))
+        found |= self._alike.check(pair.left, left_over, depth.pinhole.f_px, self._drift.doubt_rad(frame.baseline))
         if self._frozen.check(frame.left, frame.right):
             found.add(ImageFault.FROZEN)
         reasons = {_REASONS.get(fault, Reason.IMAGE_BAD) for fault in found}

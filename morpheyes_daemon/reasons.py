@@ -57,6 +57,7 @@ class Reason(StrEnum):
     DEPTH_SCALE = "depth_scale", 65, "depth does not fit the motion: the eyes are not where the servo should hold them"
     EYES_APART = "eyes_apart", 66, "the eyes' rows stay apart: not exposed together, bent, or another rig's calibration"
     EYES_LATE = "eyes_late", 67, "the time between the eyes is not the one declared"
+    BASELINE_UNKNOWN = "baseline_unknown", 68, "the eyes are still on their way to a place that is known"
     CALIBRATION_DRIFT = "calibration_drift", 64, "the eyes no longer point where the calibration says"
 
     # faults

@@ -17,7 +17,7 @@ import numpy as np
 
 from morpheyes_daemon.calibration.ego_motion import EyeMotion, row_rates
 from morpheyes_daemon.calibration.yaw_watch import Look, Uncertain, YawWatch
-from morpheyes_daemon.messages import DepthMap
+from morpheyes_daemon.messages import KNOWN_SHARE, BaselineEstimate, DepthMap
 from morpheyes_daemon.stereo.depth import RectifiedPair, disparity_of
 from morpheyes_daemon.stereo.epipolar import SHARP_S, RowFit, RowOffsets, RowWatch, levelled
 from morpheyes_daemon.stereo.rectify import rectifying_rotation
@@ -55,7 +55,7 @@ class DriftLimits:
     """Time offset between the eyes that was declared."""
     late_change_s: float = 1e-3
     """How far the measured offset may be from it."""
-    baseline_share: float = 0.05
+    baseline_share: float = KNOWN_SHARE
     """A frame whose baseline is not known to this share tells nothing."""
     yaw_pairs: int = 2
     """Pairs of frames, each of other seconds, that must agree before a yaw is called too large to be a drift."""
@@ -157,6 +157,12 @@ class DriftMonitor:
     def knows(self, depth: DepthMap) -> bool:
         """Return whether the baseline of a frame is known well enough for its rows to mean anything."""
         return depth.baseline_sigma_m < self.limits.baseline_share * depth.baseline_m
+
+    def doubt_rad(self, baseline: BaselineEstimate) -> float:
+        """Return by what angle rows may be apart since the baseline may be two sigmas off."""
+        off_m = 2.0 * baseline.sigma_m
+        places = np.clip([baseline.baseline_m - off_m, baseline.baseline_m + off_m], *self.rig.range_m)
+        return max(rows_apart_rad(self.rig, baseline.baseline_m, float(place_m)) for place_m in places)
 
     def unexplained(self, offsets: RowOffsets, depth: DepthMap) -> RowOffsets:
         """Return row offsets less those of a small turn that is being watched."""
@@ -264,6 +270,20 @@ def turned_rig(rig: RigModel, turn_rect_rad: Array, nominal_m: float) -> RigMode
     """Return the rig with its right eye turned by a rotation vector (3,) in the rectified axes at a baseline."""
     turn = turn_between(rig, nominal_m, R_from_rotvec(turn_rect_rad))
     return replace(rig, baselines=tuple(_turned(baseline, rig, turn) for baseline in rig.baselines))
+
+
+def rows_apart_rad(rig: RigModel, nominal_m: float, true_m: float) -> float:
+    """Return by what angle rows are apart, at most, when a rig at one baseline is rectified as if at another.
+
+    Pitch counts in full; roll, and the slope of the line between the eyes, up to the edge of the view and to the
+    disparity of near things, 0.4 focal lengths both.
+    """
+    T, T_true = rig.T_cam0_cam1(nominal_m), rig.T_cam0_cam1(true_m)
+    R_rect_cam0 = rectifying_rotation(T[:3, 3])
+    turn = R_rect_cam0 @ T_true[:3, :3] @ T[:3, :3].T @ R_rect_cam0.T
+    slope = float((R_rect_cam0 @ T_true[:3, 3])[1]) / float(np.linalg.norm(T_true[:3, 3]))
+    pitch, roll = (turn[2, 1] - turn[1, 2]) / 2.0, (turn[1, 0] - turn[0, 1]) / 2.0
+    return abs(float(pitch)) + 0.4 * abs(float(roll)) + 0.4 * abs(slope)
 
 
 def turn_between(rig: RigModel, nominal_m: float, R_turn_rect: Array) -> Array:

@@ -91,17 +91,17 @@ class AlikeCheck:
         self._unlike: deque[bool] = deque(maxlen=self._limits.unlike_of)
         self._apart: deque[bool] = deque(maxlen=self._limits.apart_of)
 
-    def check(self, left: Image, found: RowOffsets, f_px: float, rows_count: bool = True) -> set[ImageFault]:
+    def check(self, left: Image, found: RowOffsets, f_px: float, doubt_rad: float = 0.0) -> set[ImageFault]:
         """Look at a rectified grey left image (H, W), what was found of it in the right one, and focal length.
 
-        `rows_count` is False for a pair rectified by guess, whose rows say nothing.
+        `doubt_rad` is how far the eyes may point elsewhere than the pair was rectified for.
         """
         limits = self._limits
         unlike = found.tried >= limits.alike_points and found.count < limits.alike_share * found.tried
         unlike = unlike and _textured_share(left, limits.textured_levels) > limits.textured_share
         self._unlike.append(unlike)
-        apart = found.count >= MIN_POINTS and found.median_px > limits.apart_rad * f_px
-        self._apart.append(unlike or (apart and rows_count))
+        apart = found.count >= MIN_POINTS and found.median_px > (limits.apart_rad + doubt_rad) * f_px
+        self._apart.append(unlike or apart)
         faults = {ImageFault.UNLIKE} if sum(self._unlike) >= limits.unlike_frames else set()
         return faults | ({ImageFault.APART} if sum(self._apart) >= limits.apart_frames else set())
 

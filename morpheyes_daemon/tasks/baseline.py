@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import Clock, Ticker
 from morpheyes_daemon.control.baseline import BaselineModel
@@ -19,15 +21,26 @@ async def baseline(
     first_m: float,
     topics: Topics,
     clock: Clock,
+    tell_known: Callable[[bool], None],
     pulse: Pulse,
 ) -> None:
-    """Keep the servo where the mission wants it (`first_m` before it has spoken); raises the servo's DeviceError."""
+    """Keep the servo where the mission wants it; raises the servo's DeviceError.
+
+    After opening nobody knows where the eyes are: they first go to `first_m`, and `tell_known` hears when they must
+    have been long enough on the way. Following a mission that changes its mind could take for ever to find out.
+    """
+    known = False
+    tell_known(known)
     try:
         await servo.open()
         ticker = Ticker(clock, RATE_HZ)
         while True:
             command = topics.command.get()
-            target_m = planner.plan(command.baseline_m if command else first_m, model.at(clock.now_ns()))
+            here = model.at(clock.now_ns())
+            if here.known and not known:
+                known = True
+                tell_known(known)
+            target_m = planner.plan(command.baseline_m if command and known else first_m, here)
             if target_m is not None:
                 await _move(servo, model, target_m, clock)
             topics.baseline.publish(model.at(clock.now_ns()))

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morpheyes_daemon.calibration.drift import Drift, DriftMonitor, turned_rig
+from morpheyes_daemon.calibration.drift import Drift, DriftMonitor, rows_apart_rad, turned_rig
 from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates
 from morpheyes_daemon.calibration.rectified import StereoGeometry, infinity_px
 from morpheyes_daemon.calibration.yaw_watch import leverage
 from morpheyes_daemon.messages import BaselineEstimate, Pinhole, StereoFrame
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
 from morpheyes_daemon.stereo.epipolar import row_offsets
+from morpheyes_daemon.stereo.rectify import rectifying_rotation
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import R_from_rotvec, inverse, pose
 from tests.panels import Panel, crooked_rig, raw_pair
@@ -29,6 +30,23 @@ def test_a_rig_turned_by_a_yaw_shows_that_much_disparity_at_infinity() -> None:
     assert np.median(infinity_px(believed, true)) == pytest.approx(believed.f_px * yaw, rel=0.1)
     assert turned.length_m(0.2) == pytest.approx(rig.length_m(0.2))
     assert turned.hash != rig.hash
+
+
+def test_rows_are_no_farther_apart_than_a_wrong_baseline_can_make_them() -> None:
+    """Directions of things three metres off, as the right eye sees them and as it should for the baseline believed."""
+    rig = RigModel.from_poses(CAM0, CAM1, TEN_M.tolist(), [true_pose(b) for b in TEN_M])
+    x, y = np.meshgrid([-0.4, 0.0, 0.4], [-0.3, 0.0, 0.3])
+    points = 3.0 * np.stack([x.ravel(), y.ravel(), np.ones(9)], axis=1)
+    for nominal_m, true_m in ((0.1, 0.3), (0.2, 0.16), (0.25, 0.24)):
+        R_rect_cam0 = rectifying_rotation(rig.T_cam0_cam1(nominal_m)[:3, 3])
+        seen, expected = (inverse(rig.T_cam0_cam1(b)) for b in (true_m, nominal_m))
+        R_rect_cam1 = R_rect_cam0 @ rig.T_cam0_cam1(nominal_m)[:3, :3]
+        rays = [(points @ T[:3, :3].T + T[:3, 3]) @ R_rect_cam1.T for T in (seen, expected)]
+        rows = [ray[:, 1] / ray[:, 2] for ray in rays]
+        apart = float(np.median(np.abs(rows[0] - rows[1])))
+        bound = rows_apart_rad(rig, nominal_m, true_m)
+        assert apart <= bound <= 5.0 * apart + 2e-4
+    assert rows_apart_rad(rig, 0.2, 0.2) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_turning_back_gives_the_rig_again() -> None:

@@ -152,6 +152,15 @@ def test_rows_that_stay_apart_are_told_after_five_frames(pair):
     assert [ask(check, *good) for _ in range(4)] == [{ImageFault.APART}] * 3 + [set()], "four bad frames of eight"
 
 
+def test_rows_no_farther_apart_than_the_doubt_in_where_the_eyes_point_are_no_fault(pair):
+    left, right = pair
+    apart = np.roll(right, 2, axis=0)
+    offsets = row_offsets(left, apart, disparity(left, apart))
+    kept = {doubt_rad: AlikeCheck() for doubt_rad in (0.0, 1e-3, 4e-3)}
+    found = {doubt_rad: [check.check(left, offsets, F_PX, doubt_rad) for _ in range(6)][-1] for doubt_rad, check in kept.items()}
+    assert found == {0.0: {ImageFault.APART}, 1e-3: {ImageFault.APART}, 4e-3: set()}
+
+
 def test_rows_apart_for_a_moment_are_no_fault(pair):
     """As in a quick pitch, where 2 ms between the eyes show."""
     left, right = pair
