@@ -85,6 +85,18 @@ def test_steps_are_quick_without_overshoot(loit_speed: float, rise_s: float, lat
     assert flight.overshoot(5.0, 9.0, 2.9, 1.0) < 0.10
 
 
+@pytest.mark.parametrize(("north", "east"), [(3.7, -1.4), (1.0, 3.8), (-2.5, 2.9)])
+def test_the_course_is_the_one_wanted_while_the_lean_is_at_its_bound(north: float, east: float) -> None:
+    flight = Flight()
+    flight.fly(1.2, lambda t: (north, east, 0.0))
+    most = max(math.hypot(*flight.deflections(s)) for s in flight.sticks)
+    assert most * flight.model.lean_max_rad > math.radians(19.5)
+    way = [sum(v[axis] for v in flight.track) / 1000 for axis in (0, 1)]
+    across = (way[1] * north - way[0] * east) / math.hypot(north, east)
+    # 0.05 m/s of noise on the velocity; bounded axis by axis it would be 0.3 to 0.5 m
+    assert abs(across) < 0.1
+
+
 def test_course_is_held_while_the_vehicle_turns() -> None:
     flight = Flight()
     flight.fly(8.0, lambda t: (1.5, 0.0, 0.4 * t))
