@@ -76,7 +76,11 @@ class Reader(Generic[T]):
         """Wait for a value newer than the last one read and return the newest."""
         while self._topic.count == self._seen:
             await self._topic._changed()
-        self.dropped += self._topic.count - self._seen - 1
+        return self.newest()
+
+    def newest(self) -> T:
+        """Return the newest value at once, which counts as read; there must have been one."""
+        self.dropped += max(0, self._topic.count - self._seen - 1)
         self._seen = self._topic.count
         value = self._topic.get()
         assert value is not None

@@ -6,6 +6,7 @@ What is not connected is waited for in PREFLIGHT. Everything that decides about 
 from __future__ import annotations
 
 import asyncio
+import gc
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -106,14 +107,19 @@ async def serve(config: VehicleConfig, mission_name: str, mission: MissionFile, 
         notify("STOPPING=1")
 
 
-def event_loop() -> Callable[[], asyncio.AbstractEventLoop] | None:
-    """Return what makes uvloop's event loop where it is installed, else None for asyncio's own."""
+def real_time_runner() -> asyncio.Runner:
+    """Return what runs the daemon: uvloop's event loop where it is installed, else asyncio's own.
+
+    What is imported by now stays: the garbage collector need not look at it again, which takes longer than a stick
+    period.
+    """
+    gc.collect()
+    gc.freeze()
     try:
         import uvloop
     except ModuleNotFoundError:
-        return None
-    made: Callable[[], asyncio.AbstractEventLoop] = uvloop.new_event_loop
-    return made
+        return asyncio.Runner()
+    return asyncio.Runner(loop_factory=uvloop.new_event_loop)
 
 
 def event_line(event: Event, began_ns: int) -> str:

@@ -23,7 +23,7 @@ def command(
     """
     import asyncio
 
-    from morpheyes_daemon.service import calibration_file, event_loop, serve
+    from morpheyes_daemon.service import calibration_file, real_time_runner, serve
     from morpheyes_daemon.shipped import find_mission, load_config, load_mission
 
     vehicle = load_config(config)
@@ -32,7 +32,7 @@ def command(
     name = mission or vehicle.mission
     file = load_mission(name)
     calibration_file(vehicle)
-    with asyncio.Runner(loop_factory=event_loop()) as runner:
+    with real_time_runner() as runner:
         try:
             runner.run(serve(vehicle, find_mission(name).stem, file, lambda line: typer.echo(line, err=True)))
         except asyncio.CancelledError:

@@ -21,7 +21,7 @@ from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.experiments.flight import FlightPlan, Progress
 from morpheyes_daemon.experiments.realtime import RealtimeFlight, realtime_daemon
 from morpheyes_daemon.safety.states import State
-from morpheyes_daemon.service import event_loop
+from morpheyes_daemon.service import real_time_runner
 
 ENGAGE_LIMIT_S = 120.0
 SAMPLE_S = 5.0
@@ -80,13 +80,13 @@ class SoakBench:
 
 def bench_sticks(plan: FlightPlan, minutes: float, show: Show) -> StickBench:
     """Measure the stick beat for `minutes` after engaging."""
-    with asyncio.Runner(loop_factory=event_loop()) as runner, tempfile.TemporaryDirectory() as folder:
+    with real_time_runner() as runner, tempfile.TemporaryDirectory() as folder:
         return runner.run(_sticks(plan, minutes, show, Path(folder)))
 
 
 def bench_soak(plan: FlightPlan, minutes: float, show: Show) -> SoakBench:
     """Watch memory, tasks, threads and descriptors for `minutes` after engaging."""
-    with asyncio.Runner(loop_factory=event_loop()) as runner, tempfile.TemporaryDirectory() as folder:
+    with real_time_runner() as runner, tempfile.TemporaryDirectory() as folder:
         return runner.run(_soak(plan, minutes, show, Path(folder)))
 
 

@@ -34,7 +34,7 @@ from morpheyes_daemon.recorder.reader import read_flight
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.report import draw_report
 from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.service import build_parts, event_loop
+from morpheyes_daemon.service import build_parts, real_time_runner
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.supervisor.worker_process import ProcessWorker
 
@@ -154,7 +154,7 @@ def fly_realtime(
     `autopilot` is the first port of a running ArduPilot SITL, None the autopilot twin. Raises DeviceError when the
     simulator or the daemon cannot go on.
     """
-    with asyncio.Runner(loop_factory=event_loop()) as runner:
+    with real_time_runner() as runner:
         summary = runner.run(_fly(plan, folder, autopilot, progress))
     draw_report(read_flight(folder / "flight.mcap"), folder)
     (folder / "summary.json").write_text(json.dumps(summary.as_json(), indent=2) + "\n", encoding="utf-8")

@@ -56,10 +56,15 @@ async def mission(
     reaction_s: float,
     pulse: Pulse,
 ) -> None:
-    """Let the strategy decide on every percept; done or refused ends the flight in HOLD."""
-    percepts = topics.perception.reader()
+    """Let the strategy decide on every percept; done or refused ends the flight in HOLD.
+
+    It thinks for milliseconds, and begins when a stick message has just gone out: that long the next can wait.
+    """
+    percepts, beats = topics.perception.reader(), topics.gate.reader()
     while True:
-        seen = await percepts.next()
+        await percepts.next()
+        await beats.next()
+        seen = percepts.newest()
         observation = observe(seen, track, vehicle, guardian, clock.now_ns(), reaction_s)
         topics.observation.publish(observation)
         followed = strategy.track(seen.percept)
