@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.ego_motion import EyeMotion
-from morpheyes_daemon.messages import DepthMap, FloatMap, Image, Pinhole
+from morpheyes_daemon.messages import DepthMap, Image, Pinhole
+from morpheyes_daemon.stereo.lucas_kanade import follow_and_return
 from morpheyes_daemon.transforms import Array, R_from_rotvec
 
 _POINTS, _SPACING_PX, _WINDOW_PX = 160, 8, 15
@@ -90,7 +90,15 @@ def scale_between(first: Sight, second: Sight) -> ScaleFit | None:
     places = _rays(uv, first.depth.pinhole) * first.depth.depth_m[uv[:, 1], uv[:, 0]].astype(np.float64)[:, None]
     R_2_1 = second.motion.T_ned_rect[:3, :3].T @ first.motion.T_ned_rect[:3, :3]
     turned = places @ R_2_1.T
-    seen, good = _followed(first.left, second.left, uv, _pixels(turned - flown, second.depth.pinhole))
+    seen, good = follow_and_return(
+        first.left,
+        second.left,
+        uv,
+        _pixels(turned - flown, second.depth.pinhole),
+        window_px=_WINDOW_PX,
+        levels=3,
+        return_px=_RETURN_PX,
+    )
     if good.sum() < _FEWEST_POINTS:
         return None
     rays = _rays(seen[good], second.depth.pinhole)[:, :2]
@@ -110,22 +118,6 @@ def _telling_points(sight: Sight) -> Array:
     mask = (depth.depth_m < limit_m).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(sight.left, _POINTS, 0.01, _SPACING_PX, mask=mask)
     return np.empty((0, 2), np.int64) if corners is None else np.rint(corners.reshape(-1, 2)).astype(np.int64)
-
-
-def _followed(first: Image, second: Image, uv: Array, guess: Array) -> tuple[Array, NDArray[np.bool_]]:
-    start = uv.astype(np.float32)
-    seen, found = _lucas_kanade(first, second, start, guess.astype(np.float32))
-    back, returned = _lucas_kanade(second, first, seen, start)
-    near = np.abs(back - start).max(axis=1) < _RETURN_PX
-    return seen.astype(np.float64), found & returned & near
-
-
-def _lucas_kanade(first: Image, second: Image, points: FloatMap, guess: FloatMap) -> tuple[FloatMap, NDArray[np.bool_]]:
-    window = (_WINDOW_PX, _WINDOW_PX)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, points, guess.copy(), winSize=window, maxLevel=3, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
-    )
-    return np.asarray(found, np.float32), np.asarray(status).ravel() > 0
 
 
 def _fit(turned: Array, flown: Array, rays: Array, f_px: float, flown_sigma_m: float) -> ScaleFit | None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates
 from morpheyes_daemon.messages import FloatMap, Image, Pinhole
+from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.transforms import Array, inverse
 
 LEAST_CHANGE_M = 0.04
@@ -235,18 +236,9 @@ def _followed(first: Look, second: Look, uv_1: Array, p_2: Array) -> tuple[Array
 
 
 def _follow(before: Image, after: Image, uv: Array, guess: Array, levels: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Track points by Lucas and Kanade from `guess`."""
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        before,
-        after,
-        uv.astype(np.float32).reshape(-1, 1, 2),
-        guess.astype(np.float32).reshape(-1, 1, 2),
-        winSize=(_WINDOW_PX, _WINDOW_PX),
-        maxLevel=levels,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )
-    inside = np.all((found[:, 0] > 0) & (found[:, 0] < [after.shape[1] - 1, after.shape[0] - 1]), axis=1)
-    return found.reshape(-1, 2).astype(np.float64), (status.ravel() == 1) & inside
+    found, followed = follow(before, after, uv, guess, window_px=_WINDOW_PX, levels=levels)
+    inside = np.all((found > 0) & (found < [after.shape[1] - 1, after.shape[0] - 1]), axis=1)
+    return found, followed & inside
 
 
 def _solve(

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages import FloatMap, Image, Pinhole
+from morpheyes_daemon.stereo.lucas_kanade import follow_and_return
 from morpheyes_daemon.transforms import Array
 
 CELLS = (24, 18)
@@ -102,36 +103,23 @@ def row_offsets(left: Image, right: Image, disparity_px: FloatMap) -> RowOffsets
     uv = _textured_points(left, disparity_px)
     d = disparity_px[uv[:, 1], uv[:, 0]]
     inside = (uv[:, 0] - d >= WINDOW_PX // 2) & (uv[:, 0] - d < left.shape[1] - WINDOW_PX // 2)
-    start, d = uv[inside].astype(np.float32), d[inside]
+    start, d = uv[inside].astype(np.float64), d[inside].astype(np.float64)
     if not len(start):
         return RowOffsets(np.empty((0, 2)), np.empty(0), np.empty(0))
     expected = start - np.stack([d, np.zeros_like(d)], axis=1)
-    found, good = _followed(left, right, start, expected)
-    back, returned = _followed(right, left, found, start)
+    found, good = follow_and_return(
+        left,
+        right,
+        start,
+        expected,
+        window_px=WINDOW_PX,
+        levels=1,
+        return_px=RETURN_PX,
+        least_texture=1e-3,
+    )
     aside, down = (found - expected).T
-    good &= returned & (np.abs(back - start).max(axis=1) < RETURN_PX)
     good &= (np.abs(aside) < SIDEWAYS_PX) & (np.abs(down) < REACH_PX)
-    return RowOffsets(
-        start[good].astype(np.float64),
-        (d - aside)[good].astype(np.float64),
-        down[good].astype(np.float64),
-        len(start),
-    )
-
-
-def _followed(first: Image, second: Image, points: FloatMap, guess: FloatMap) -> tuple[FloatMap, NDArray[np.bool_]]:
-    """Return where points (n, 2) of the first image are in the second, beginning at `guess`, and which were found."""
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        first,
-        second,
-        points,
-        guess.copy(),
-        winSize=(WINDOW_PX, WINDOW_PX),
-        maxLevel=1,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=1e-3,
-    )
-    return np.asarray(found, dtype=np.float32), np.asarray(status).ravel() > 0
+    return RowOffsets(start[good], (d - aside)[good], down[good], len(start))
 
 
 def _textured_points(left: Image, disparity_px: FloatMap) -> NDArray[np.intp]:

@@ -1,0 +1,58 @@
+"""Points followed from one image to another, by Lucas and Kanade's method on image pyramids (Bouguet 2001)."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from morpheyes_daemon.messages import Image
+from morpheyes_daemon.transforms import Array
+
+
+def follow(
+    first: Image,
+    second: Image,
+    uv: Array,
+    guess: Array,
+    *,
+    window_px: int,
+    levels: int,
+    least_texture: float = 1e-4,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return where points (n, 2) of the first grey image are in the second, beginning at `guess`, and which were found.
+
+    `levels` halvings of the images beside themselves; `least_texture` is the smallest eigenvalue of a window's
+    gradients, per pixel, below which a point is not found.
+    """
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        np.ascontiguousarray(uv, dtype=np.float32).reshape(-1, 1, 2),
+        np.array(guess, dtype=np.float32).reshape(-1, 1, 2),
+        winSize=(window_px, window_px),
+        maxLevel=levels,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=least_texture,
+    )
+    return np.asarray(found, dtype=np.float64).reshape(-1, 2), np.asarray(status).ravel() == 1
+
+
+def follow_and_return(
+    first: Image,
+    second: Image,
+    uv: Array,
+    guess: Array,
+    *,
+    window_px: int,
+    levels: int,
+    return_px: float,
+    least_texture: float = 1e-4,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return as `follow` does, but only those as found that the way back leads home to within `return_px`."""
+    step = partial(follow, window_px=window_px, levels=levels, least_texture=least_texture)
+    found, there = step(first, second, uv, guess)
+    back, home = step(second, first, found, uv)
+    return found, there & home & (np.abs(back - uv).max(axis=1, initial=0.0) < return_px)
