@@ -50,7 +50,6 @@ class Campaign:
         )
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
-
     def settings(self) -> Row:
         """Return what a reader of the results wants to know."""
         plan = self.plan
@@ -255,6 +254,8 @@ def _read(path: Path, key: str) -> list[Row]:
                 raise InputError(f"{path}:{number + 1}: is not a flight; give another --out.") from None
     if any(row.get("campaign") != key for row in rows):
         raise InputError(f"{path.parent}: holds flights of another campaign; give another --out.")
-    whole = "".join(json.dumps(row) + "\n" for row in rows)
-    path.write_text(whole, encoding="utf-8")
+    if not path.read_bytes().endswith(b"\n"):
+        whole = path.with_suffix(".whole")
+        whole.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+        whole.replace(path)
     return rows

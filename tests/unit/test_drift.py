@@ -1,6 +1,7 @@
 """The drift watch: a turned rig is what it says, strong evidence is needed, and nothing is done without texture."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -121,3 +122,14 @@ def test_an_eye_that_turned_far_is_broken_and_not_mended() -> None:
     monitor, told = watched(0.3, WORLD, frames=15)
     assert told == [Drift.ROWS, Drift.BROKEN]
     assert monitor.broken
+
+
+def test_a_yaw_too_large_for_a_drift_must_be_seen_by_two_pairs_of_frames() -> None:
+    rig = RigModel.from_poses(CAM0, CAM1, TEN_M.tolist(), [true_pose(b) for b in TEN_M])
+    monitor, yaw_rad = DriftMonitor(rig), math.radians(0.5)
+    found = {}
+    for pairs in (1, 2):
+        monitor._yaw = SimpleNamespace(yaw_rad=yaw_rad, sigma_rad=0.02 * yaw_rad, pairs=pairs)  # type: ignore[assignment]
+        found[pairs] = [finding.what for finding in monitor._judge_yaw(740.0, 0.2)], monitor.broken
+    assert found == {1: ([Drift.DOUBTED], False), 2: ([Drift.BROKEN], True)}
+    assert monitor.rig.hash == rig.hash, "and nothing was corrected"
