@@ -32,6 +32,7 @@ class Ending(StrEnum):
     """How a fault in a state must end; `complaints` checks each."""
 
     FLIES = "flies on"
+    FLIES_WITH_PAUSES = "flies on, neutral whenever too much is missing"
     RESUMES = "neutral, then flies on"
     HOLDS = "neutral until the pilot acts"
     HOLDS_IF_IT_MATTERS = "flies on, or neutral until the pilot acts"
@@ -119,6 +120,10 @@ def _flies(fault: Fault, state: State, seen: Measured) -> Complaints:
     yield from _expect(seen.neutrals <= 2, f"braked ({seen.neutrals} neutral messages)")
 
 
+def _flies_with_pauses(fault: Fault, state: State, seen: Measured) -> Complaints:
+    yield from _in(seen, State.ENGAGED, State.BRAKING)
+
+
 def _resumes(fault: Fault, state: State, seen: Measured) -> Complaints:
     yield from _reacted(fault, state, seen.reaction_s)
     yield from _in(seen, State.ENGAGED)
@@ -179,6 +184,7 @@ def _refuses(fault: Fault, state: State, seen: Measured) -> Complaints:
 
 _RULES: dict[Ending, _Rule] = {
     Ending.FLIES: _flies,
+    Ending.FLIES_WITH_PAUSES: _flies_with_pauses,
     Ending.RESUMES: _resumes,
     Ending.HOLDS: _holds,
     Ending.HOLDS_IF_IT_MATTERS: _holds_if_it_matters,

@@ -41,6 +41,7 @@ _STOPPED = _row(E.HOLDS, E.HOLDS, E.HOLDS, E.UNREADY)
 _STOPPED_THEN_WELL = _row(E.HOLDS, E.HOLDS, E.HOLDS, E.READY)
 _BLIP = _row(E.RESUMES, None, E.HOLDS, E.READY)
 _HARMLESS = _row(E.FLIES, E.RESUMES, E.HOLDS, E.READY)
+_PATCHY = _row(E.FLIES_WITH_PAUSES, E.FLIES_WITH_PAUSES, E.HOLDS, E.READY)
 _TAKEN = _row(E.RELEASES, E.RELEASES, E.RELEASES, None)
 _LEFT = _row(E.LETS_GO, E.LETS_GO, E.LETS_GO, E.UNREADY)
 _PERHAPS = _row(E.HOLDS_IF_IT_MATTERS, E.HOLDS_IF_IT_MATTERS, E.HOLDS, None)
@@ -177,7 +178,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault("link-blip", "both directions silent for 0.2 s", 0.0, _HARMLESS, acts.lose_link, acts.mend_link, 0.2),
     Fault("link-garbage", "random bytes between the messages", 0.0, _HARMLESS, acts.noisy_link),
-    Fault("link-truncated", "every fifth message cut short", 0.0, _HARMLESS, acts.cutting_link),
+    Fault("link-truncated", "one message in five is cut short", 0.0, _PATCHY, acts.cutting_link),
     Fault("link-reordered", "messages overtake each other", 0.0, _HARMLESS, acts.swapping_link),
     Fault("link-doubled", "every message twice, both ways", 0.0, _HARMLESS, acts.doubling_link),
     Fault("forged-sender", "a stranger says: switch off, disarmed", 0.0, _HARMLESS, acts.forge),
