@@ -66,6 +66,7 @@ RELEASED = replace(HELD, state=State.RELEASED, release_s=0.12, last=Sent.RELEASE
 SILENT = replace(SEEN, state=State.STANDBY, last=None, last_s=None)
 GOOD: dict[Ending, Measured] = {
     Ending.FLIES: SEEN,
+    Ending.FLIES_WITH_PAUSES: replace(SEEN, state=State.BRAKING, last=Sent.NEUTRAL, neutrals=40),
     Ending.RESUMES: replace(SEEN, reaction_s=0.2, neutrals=20, sticks_after=100),
     Ending.HOLDS: HELD,
     Ending.HOLDS_IF_IT_MATTERS: HELD,
@@ -79,6 +80,8 @@ BAD: list[tuple[Ending, dict[str, object]]] = [
     (Ending.FLIES, {"state": State.HOLD}),
     (Ending.FLIES, {"last": Sent.NEUTRAL}),
     (Ending.FLIES, {"neutrals": 3}),
+    (Ending.FLIES_WITH_PAUSES, {"state": State.HOLD}),
+    (Ending.FLIES_WITH_PAUSES, {"state": State.RELEASED}),
     (Ending.RESUMES, {"reaction_s": 0.4}),
     (Ending.RESUMES, {"reaction_s": None}),
     (Ending.RESUMES, {"sticks_after": 0}),
