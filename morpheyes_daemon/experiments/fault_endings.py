@@ -6,6 +6,7 @@ time-out acts, and the vehicle must stop within what the governor had kept free.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -117,7 +118,7 @@ def _silent(seen: Measured) -> Complaints:
 def _flies(fault: Fault, state: State, seen: Measured) -> Complaints:
     yield from _in(seen, State.ENGAGED)
     yield from _expect(seen.last is Sent.STICKS, "does not fly")
-    yield from _expect(seen.neutrals <= 2, f"braked ({seen.neutrals} neutral messages)")
+    yield from _expect(not seen.left, "did not stay engaged")
 
 
 def _flies_with_pauses(fault: Fault, state: State, seen: Measured) -> Complaints:
@@ -147,19 +148,29 @@ def _releases(fault: Fault, state: State, seen: Measured) -> Complaints:
     yield from _expect(seen.state not in HOLDING, f"ended in {seen.state} ({seen.reason})")
     in_time = seen.release_s is not None and seen.release_s <= limit_s
     yield from _expect(in_time, f"released after {seen.release_s} s, allowed {limit_s:.2f} s")
-    yield from _gone(seen)
+    yield from _gone(fault, state, seen)
 
 
-def _gone(seen: Measured) -> Complaints:
+def _gone(fault: Fault, state: State, seen: Measured) -> Complaints:
     yield from _expect(seen.last is Sent.RELEASE, f"the last message was {seen.last}")
-    yield from _expect(seen.sticks_after == 0, "sticks afterwards")
+    yield from _flown_out(fault, state, seen)
+
+
+def _flown_out(fault: Fault, state: State, seen: Measured) -> Complaints:
+    """Once neutral, no stick again; but a flight that comes out of BRAKING may fly on until it has noticed."""
+    if state is not State.BRAKING:
+        yield from _expect(seen.sticks_after == 0, "sticks afterwards")
+        return
+    limit_s = math.inf if fault.kind == "B" else fault.notice_s + REACTION_S
+    in_time = seen.quiet_s is None or seen.quiet_s <= limit_s
+    yield from _expect(seen.last is not Sent.STICKS and in_time, f"sticks for {seen.quiet_s} s, allowed {limit_s:.2f} s")
 
 
 def _lets_go(fault: Fault, state: State, seen: Measured) -> Complaints:
     yield from _reacted(fault, state, seen.quiet_s)
     yield from _in(seen, State.PILOT, State.RELEASED)
     yield from _expect(seen.neutrals > 0, "no neutral before the release")
-    yield from _gone(seen)
+    yield from _gone(fault, state, seen)
 
 
 def _ready(fault: Fault, state: State, seen: Measured) -> Complaints:
@@ -175,7 +186,7 @@ def _unready(fault: Fault, state: State, seen: Measured) -> Complaints:
 def _stops(fault: Fault, state: State, seen: Measured) -> Complaints:
     yield from _expect(seen.stopped, "still moves")
     yield from _expect(seen.stop_m <= seen.reserved_m, f"stopped after {seen.stop_m:.2f} m of {seen.reserved_m:.2f} m")
-    yield from _expect(seen.sticks_after == 0, "sticks afterwards")
+    yield from _flown_out(fault, state, seen)
 
 
 def _refuses(fault: Fault, state: State, seen: Measured) -> Complaints:

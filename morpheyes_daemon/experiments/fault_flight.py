@@ -65,7 +65,8 @@ class Measured:
     """What one fault did. Times count from the fault; None: it did not happen.
 
     `reaction_s`: the first message that deflects no stick; `quiet_s`: the first after which none did. `release_s`: the
-    first release. `neutrals` counts neutral messages, `sticks_after` the others after the reaction. `stop_m`: flown
+    first release. `neutrals` counts neutral messages, `sticks_after` the others after the reaction; `left` tells whether
+    the daemon was ever in another state than ENGAGED. `stop_m`: flown
     from the fault to standstill; `reserved_m`: what the governor had kept free for that at the moment of the fault.
     """
 
@@ -75,6 +76,7 @@ class Measured:
     quiet_s: float | None
     release_s: float | None
     neutrals: int
+    left: bool
     sticks_after: int
     last: Sent | None
     last_s: float | None
@@ -210,6 +212,8 @@ class FaultFlight:
         """Watch for a while from now, the moment of the fault."""
         began_ns, first, heard = self.clock.now_ns(), len(self._sent), len(self._events)
         reserved_m = self._reserved_m()
+        states: list[State] = []
+        self.topics.gate.tap(lambda out: states.append(out.state))
         path = _Path(self.stage)
         while self.clock.now_ns() - began_ns < seconds * S:
             path.sample(self.clock.now_ns())
@@ -225,6 +229,7 @@ class FaultFlight:
             quiet_s=_quiet_s(sent),
             release_s=released[0] if released else None,
             neutrals=[kind for _, kind in sent].count(Sent.NEUTRAL),
+            left=any(state is not State.ENGAGED for state in states),
             sticks_after=after.count(Sent.STICKS),
             last=sent[-1][1] if sent else None,
             last_s=sent[-1][0] if sent else None,

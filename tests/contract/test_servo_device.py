@@ -221,6 +221,24 @@ def test_a_restarted_teensy_is_sent_to_its_target_again() -> None:
     flies(scene())
 
 
+@pytest.mark.parametrize("after_ms", range(505, 605, 20))
+def test_a_restart_is_noticed_though_a_new_target_comes_before_the_first_status(after_ms: int) -> None:
+    """The Teensy stood still while it booted, which the baseline's model must hear of."""
+
+    async def scene() -> None:
+        async with bench() as b:
+            await b.servo.open()
+            await b.servo.move(0.250)
+            await passes(0.4)
+            b.twin.reboot()
+            await passes(after_ms / 1e3)
+            await b.servo.move(0.2)
+            await passes(1.0)
+            assert b.reasons() == [Reason.SERVO_LOST, Reason.RECOVERED]
+
+    flies(scene())
+
+
 def test_a_pulled_cable_fails_the_move_and_is_opened_again() -> None:
     async def scene() -> None:
         async with bench() as b:

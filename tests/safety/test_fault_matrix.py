@@ -56,7 +56,7 @@ def fault(ending: Ending, state: State = State.ENGAGED, **more: object) -> Fault
 
 
 SEEN = Measured(
-    state=State.ENGAGED, reason=Reason.ENGAGED, reaction_s=None, quiet_s=None, release_s=None, neutrals=0,
+    state=State.ENGAGED, reason=Reason.ENGAGED, reaction_s=None, quiet_s=None, release_s=None, neutrals=0, left=False,
     sticks_after=0, last=Sent.STICKS, last_s=6.98, stop_m=3.0, stopped=True, reserved_m=4.0, clearance_m=0.5, events=(),
 )  # fmt: skip
 HELD = replace(
@@ -79,7 +79,7 @@ GOOD: dict[Ending, Measured] = {
 BAD: list[tuple[Ending, dict[str, object]]] = [
     (Ending.FLIES, {"state": State.HOLD}),
     (Ending.FLIES, {"last": Sent.NEUTRAL}),
-    (Ending.FLIES, {"neutrals": 3}),
+    (Ending.FLIES, {"left": True}),
     (Ending.FLIES_WITH_PAUSES, {"state": State.HOLD}),
     (Ending.FLIES_WITH_PAUSES, {"state": State.RELEASED}),
     (Ending.RESUMES, {"reaction_s": 0.4}),
@@ -123,6 +123,16 @@ def test_what_ends_as_it_must_is_not_complained_of(ending: Ending) -> None:
 @pytest.mark.parametrize(("ending", "changes"), BAD, ids=str)
 def test_each_rule_notices_what_it_is_for(ending: Ending, changes: dict[str, object]) -> None:
     assert complaints(fault(ending), State.ENGAGED, replace(GOOD[ending], **changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("ending", [Ending.RELEASES, Ending.LETS_GO, Ending.STOPS])
+def test_out_of_braking_it_may_fly_on_until_it_has_noticed_and_no_longer(ending: Ending) -> None:
+    one = fault(ending, State.BRAKING)
+    seen = replace(GOOD[ending], sticks_after=5, quiet_s=0.3)
+    assert complaints(one, State.BRAKING, seen) == []
+    assert complaints(one, State.BRAKING, replace(seen, last=Sent.STICKS))
+    late = complaints(one, State.BRAKING, replace(seen, quiet_s=0.4))
+    assert bool(late) is (one.kind == "A"), "a daemon that is cut off does not know"
 
 
 def test_a_daemon_that_starts_where_it_must_refuse_is_complained_of() -> None:

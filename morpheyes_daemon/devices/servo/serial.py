@@ -180,9 +180,11 @@ class SerialServo:
             self._recovered()
 
     def _on_status(self, status: wire.Status) -> None:
-        self.status = status
-        if wire.StatusFlag.COLD in status.flags and self._target is not None and self._link is not None:
-            self._lost(Reason.SERVO_LOST, "the Teensy restarted and has forgotten its target; it is sent again")
+        """A Teensy that restarted stood still meanwhile, even if a repeated target has reached it since."""
+        before, self.status = self.status, status
+        restarted = before is not None and status.uptime_ms < before.uptime_ms
+        if (restarted or wire.StatusFlag.COLD in status.flags) and self._target is not None and self._link is not None:
+            self._lost(Reason.SERVO_LOST, "the Teensy restarted and had forgotten its target; it is sent again")
             self._link.write(wire.encode(self._target))
 
     def _on_lost(self, link_number: int, reason: str) -> None:
@@ -194,6 +196,7 @@ class SerialServo:
         if link is None:
             return
         link.close()
+        self.status = None
         if self._keeper is not None:
             self._lost(Reason.SERVO_LOST, reason)
         for waiting in (self._ack, self._welcome):
