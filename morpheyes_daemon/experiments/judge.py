@@ -18,6 +18,8 @@ from morpheyes_daemon.safety.states import State
 RATE_HZ = 50.0
 GOAL_TOLERANCE_M = 4.0
 """Goal radius plus the autopilot's own drift over a flight."""
+SKIDS_M = 0.06
+"""Half the height of the hull: nearer to the ground the vehicle touches it."""
 GIVEN_UP_S = 4.0
 """A flight that has been in HOLD for so long will not go on by itself."""
 
@@ -76,6 +78,7 @@ class Judge:
         self._peak_m_s = 0.0
         self._clearance_m = math.inf
         self._baselines = (math.inf, -math.inf)
+        self._height_m = math.inf
         self._braking = 0
         self._state: State | None = None
         gate.tap(self._count)
@@ -104,12 +107,15 @@ class Judge:
             self._path_m += math.dist(place, self._last)
         self._last = place
         self._peak_m_s = max(self._peak_m_s, math.hypot(truth.v_ned_m_s[0], truth.v_ned_m_s[1]))
+        self._height_m = min(self._height_m, truth.height_m)
         self._baselines = (min(self._baselines[0], baseline_m), max(self._baselines[1], baseline_m))
 
     def _decide(self, now_ns: int) -> tuple[Outcome, str] | None:
         state, reason = self._guardian.state, self._guardian.reason
         if self._clearance_m < 0.0:
             return Outcome.COLLIDED, f"hull or bar {-self._clearance_m * 1e3:.0f} mm into an obstacle"
+        if self._height_m <= SKIDS_M and state is State.ENGAGED:
+            return Outcome.COLLIDED, "the ground touched in flight"
         if self._engaged_ns and now_ns - self._engaged_ns > self._limit_s * S:
             return Outcome.TIMEOUT, f"not there after {self._limit_s:.0f} s"
         if not self._engaged_ns or state is not State.HOLD:

@@ -74,16 +74,20 @@ class Stage:
     ) -> None:
         seed = scenario.seed
         self.clock = clock
-        self.world: World = build_world(load_world(scenario.world), seed)
+        file = load_world(scenario.world)
+        self.world: World = build_world(file, seed)
         wind = WindConditions(scenario.wind_m_s, random.Random(f"wind from {seed}").uniform(-math.pi, math.pi))
         north, east, _ = self.world.start_ned_m
-        self.autopilot = AutopilotTwin(Vehicle(wind=wind, seed=seed, start_ned_m=(north, east)), clock, seed=seed)
+        craft = Vehicle(wind=wind, seed=seed, start_ned_m=(north, east), ground=self.world.ground)
+        self.autopilot = AutopilotTwin(craft, clock, seed=seed)
         self.vehicle: FlyingVehicle = vehicle or self.autopilot
         self.radio = self.vehicle.radio
         self.teensy = TeensyTwin(_servo_truth(config), clock, seed)
         self._fixed_m = config.servo.baseline_mm / 1e3 if isinstance(config.servo, NoServoConfig) else None
         self.rig = RigTwin(config.camera.width_px, config.camera.height_px, scenario.rig_seed)
         sensor = replace(scenario.sensor, sync_offset_s=config.camera.sync_error_ms / 1e3)
+        if file.light is not None:
+            sensor = replace(sensor, flicker=max(sensor.flicker, file.light.unsteady))
         self._epoch_ns = clock.now_ns()
         self.camera = CameraTwin(
             Renderer(self.world.scene), self.rig, config.camera.mount, sensor, seed, self._epoch_ns, render_threads

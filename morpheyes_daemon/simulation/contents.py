@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from morpheyes_daemon.simulation.collision import MovingObstacles, Solid
+from morpheyes_daemon.simulation.ground import LEVEL, Ground
 from morpheyes_daemon.simulation.meshes import Surface
 from morpheyes_daemon.simulation.motion import PoseAt
 from morpheyes_daemon.simulation.scene import Bgr, Material, Mesh, MovingObject
@@ -38,7 +39,7 @@ class GapTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contents:
-    """Some things of a world; adding two gives both."""
+    """Some things of a world; adding two gives both, on the ground of the first."""
 
     meshes: tuple[Mesh, ...] = ()
     solids: tuple[Solid, ...] = ()
@@ -48,6 +49,7 @@ class Contents:
     gaps: tuple[GapTruth, ...] = ()
     materials: Mapping[str, Material] = field(default_factory=dict)
     textures: Mapping[str, Texture] = field(default_factory=dict)
+    ground: Ground = LEVEL
 
     def __add__(self, other: Contents) -> Contents:
         return Contents(
@@ -59,6 +61,7 @@ class Contents:
             self.gaps + other.gaps,
             {**self.materials, **other.materials},
             {**self.textures, **other.textures},
+            self.ground,
         )
 
 

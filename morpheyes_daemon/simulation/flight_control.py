@@ -27,6 +27,8 @@ _BRAKE_JERK_M_S3 = 1.6
 
 _HEIGHT_P_1_S = 1.0
 _CLIMB_P_1_S = 5.0
+_SURFACE_TRACKING_S = 1.0
+"""With a downward rangefinder Loiter keeps its height over what is below, smoothed over SURFTRAK_TC (ArduCopter 4)."""
 _SPOOL_UP_S = 2.0
 _LANDED_AFTER_S = 1.0
 _HOME_M = 0.5
@@ -60,7 +62,7 @@ class FlightControl:
         self._moving: VelocityReference | None = None
         self._north, self._east = Tracking(), Tracking()
         self._climb_m_s = 0.0
-        self._height_m = 0.0
+        self._height_m = self._surface_m = 0.0
         self._takeoff_m: float | None = None
         self._phase = Phase.CLIMB
         self._phase_s = 0.0
@@ -115,7 +117,8 @@ class FlightControl:
 
     def _start_vertical(self) -> None:
         self._climb_m_s = -self._vehicle.v_down_m_s
-        self._height_m = self._vehicle.height_m
+        self._surface_m = self._vehicle.surface_m
+        self._height_m = -self._vehicle.down_m - self._surface_m
 
     def step(self, pilot: PilotInput) -> None:
         """Set the vehicle's controls for the next physics step."""
@@ -205,7 +208,9 @@ class FlightControl:
         change = max(-most, min(most, climb_m_s - self._climb_m_s))
         self._climb_m_s += change
         self._height_m += self._climb_m_s * STEP_S
-        off_m = max(-1.0, min(1.0, self._height_m - vehicle.height_m))
+        if self.settings.surface_tracking:
+            self._surface_m += (vehicle.surface_m - self._surface_m) * STEP_S / _SURFACE_TRACKING_S
+        off_m = max(-1.0, min(1.0, self._height_m + self._surface_m + vehicle.down_m))
         wanted = self._climb_m_s + _HEIGHT_P_1_S * off_m
         return change / STEP_S + _CLIMB_P_1_S * (wanted + vehicle.v_down_m_s)
 

@@ -61,6 +61,7 @@ class FlightSettings:
     land_low_m: float
     rtl_height_m: float
     rtl_wait_s: float
+    surface_tracking: bool
 
     @classmethod
     def of(cls, table: ParameterTable) -> FlightSettings:
@@ -92,6 +93,7 @@ class FlightSettings:
             land_low_m=table["LAND_ALT_LOW"] / 100.0,
             rtl_height_m=table["RTL_ALT"] / 100.0,
             rtl_wait_s=table["RTL_LOIT_TIME"] / 1000.0,
+            surface_tracking=table["RNGFND1_TYPE"] != 0,
         )
 
     def climb_rate_m_s(self, throttle: float, middle: float) -> float:

@@ -7,7 +7,6 @@ the start and the goal. The planted area is wider than the belt that flights use
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 import cv2
@@ -17,10 +16,12 @@ from pydantic import Field, model_validator
 
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.simulation import meshes, textures
-from morpheyes_daemon.simulation.collision import Solid, ellipsoid_solid, frustum_solid
-from morpheyes_daemon.simulation.contents import Contents, Disc
-from morpheyes_daemon.simulation.scene import GROUND_OBJECT, Bgr, Light, Material, Mesh
-from morpheyes_daemon.simulation.species import BROADLEAVES, CONIFERS, Layer, Species, broadleaf, conifer
+from morpheyes_daemon.simulation.contents import Contents
+from morpheyes_daemon.simulation.ground import Ground, Relief, lay
+from morpheyes_daemon.simulation.scene import GROUND_OBJECT, Light, Material, Mesh
+from morpheyes_daemon.simulation.species import BROADLEAVES, CONIFERS, broadleaf, conifer
+from morpheyes_daemon.simulation.trees import Tree, tree_meshes
+from morpheyes_daemon.simulation.undergrowth import Area, Glades, Undergrowth, bushes, with_branches, with_bushes
 from morpheyes_daemon.transforms import Array
 
 LIGHT_MAP_PX = 2048
@@ -28,14 +29,16 @@ LIGHT_MAP_PX = 2048
 MAP_HEIGHT_M = 1.5
 """Height at which trunks are drawn on maps."""
 
+GROUND_STEP_M = 2.0
+"""Between the grid lines of ground that is not level; the mesh is within 5 cm of waves of 1.5 m in 25 m."""
+
+ROW_STEP_M, ROW_RADIUS_M = 0.5, 0.2
+"""Trunks of a row; 10 cm are free between two."""
+
+_AROUND = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+
 FAR_GROUND_M = 110.0
 """The ground goes on this far past the trees; from there on the woods of the sky take over."""
-
-RANGES = ((0.0, 16.0), (16.0, 40.0), (40.0, 110.0))
-"""Distances in metres at which the levels of detail of foliage are drawn."""
-
-TRUNK_SIDES = ((20, (0.0, 5.0)), (12, (5.0, 14.0)), (8, (14.0, 32.0)), (6, (32.0, 110.0)))
-"""Sides of the prism that stands for a trunk, within half a pixel of it at f = 740 px, by distance in metres."""
 
 
 class ForestWorld(Section):
@@ -53,59 +56,17 @@ class ForestWorld(Section):
     run_in_m: float = Field(15.0, ge=2, le=100, description="trees are planted this far behind the start")
     max_lean_deg: float = Field(2.0, ge=0, le=10)
     conifers: float = Field(0.4, ge=0, le=1, description="share of trees")
+    undergrowth: Undergrowth = Undergrowth()
+    relief: Relief = Relief()
+    rows: tuple[tuple[float, float, float, float], ...] = Field(
+        (), description="x, y to x, y: trunks so close that nothing flies through"
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> ForestWorld:
         if self.radius_min_m > self.radius_max_m:
             raise ValueError("radius_min_m must not be greater than radius_max_m")
         return self
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tree:
-    """A tapered trunk from `base` to `top` (ned) and the foliage it carries, turned about the trunk."""
-
-    base: Array
-    top: Array
-    radius_m: float
-    top_radius_m: float
-    species: Species
-    conifer: bool
-    width_m: float
-    turn_rad: float
-    bark: str
-    tone: float
-    tint: Bgr
-
-    @property
-    def height_m(self) -> float:
-        """Length of the trunk."""
-        return float(np.linalg.norm(self.top - self.base))
-
-    def radius_at_m(self, height_m: float) -> float:
-        """Return the trunk's radius at a height above its base."""
-        return self.radius_m + height_m / self.height_m * (self.top_radius_m - self.radius_m)
-
-    def disc_at(self, height_m: float) -> Disc:
-        """Return the trunk's section at a height."""
-        middle = self.base + height_m / self.height_m * (self.top - self.base)
-        return Disc(float(middle[0]), float(middle[1]), self.radius_at_m(height_m))
-
-    def placed(self, unit: Array) -> Array:
-        """Return unit-space points (n, 3) of the species in ned: turned, widened, carried along the trunk."""
-        c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
-        across = self.width_m * np.array([[c, s, 0.0], [-s, c, 0.0]])
-        return np.asarray(self.base + unit @ np.vstack([across, self.top - self.base]))
-
-    def crowns(self) -> list[tuple[Array, Array]]:
-        """Return the ellipsoids of foliage: centre (ned) and radii (across, across, up)."""
-        centres = self.placed(self.species.crowns[:, :3])
-        radii = self.species.crowns[:, 3:] * (self.width_m, self.width_m, self.height_m)
-        return list(zip(centres, radii, strict=True))
-
-
-Glades = tuple[tuple[float, float, float], ...]
-"""Places kept free of trees: x, y, radius in metres."""
 
 
 def plant(world: ForestWorld, seed: int, glades: Glades = ()) -> list[Tree]:
@@ -116,8 +77,9 @@ def plant(world: ForestWorld, seed: int, glades: Glades = ()) -> list[Tree]:
     lean_rad = math.radians(world.max_lean_deg)
     # leaning trunks keep the gap up to 3 m above the ground
     gap = world.gap_m + 2 * 3.0 * math.tan(lean_rad)
-    kept = [(0.0, 0.0, world.clearing_m), (world.course_m, 0.0, world.clearing_m), *glades]
+    kept = (*_ends(world), *glades)
     places = np.empty((wanted, 3))
+    ground = lay(world.relief, seed)
     trees: list[Tree] = []
     for _ in range(100 * wanted):
         if len(trees) == wanted:
@@ -128,15 +90,29 @@ def plant(world: ForestWorld, seed: int, glades: Glades = ()) -> list[Tree]:
         free = bool(np.all(distance - places[: len(trees), 2] - radius >= gap))
         if free and all(math.hypot(x - gx, y - gy) - radius >= r for gx, gy, r in kept):
             places[len(trees)] = x, y, radius
-            trees.append(_grow(rng, world, x, y, radius, lean_rad))
+            trees.append(_grow(rng, world, ground, x, y, radius, lean_rad))
     return trees
 
 
-def _grow(rng: np.random.Generator, world: ForestWorld, x: float, y: float, radius: float, lean_rad: float) -> Tree:
+def plant_rows(world: ForestWorld, seed: int) -> list[Tree]:
+    """Place upright trunks along the rows."""
+    rng, ground = np.random.default_rng([seed, 105]), lay(world.relief, seed)
+    trees = []
+    for x0, y0, x1, y1 in world.rows:
+        count = math.ceil(math.hypot(x1 - x0, y1 - y0) / ROW_STEP_M)
+        for part in np.linspace(0.0, 1.0, count + 1).tolist():
+            trees.append(_grow(rng, world, ground, x0 + part * (x1 - x0), y0 + part * (y1 - y0), ROW_RADIUS_M, 0.0))
+    return trees
+
+
+def _grow(
+    rng: np.random.Generator, world: ForestWorld, ground: Ground, x: float, y: float, radius: float, lean_rad: float
+) -> Tree:
     height = rng.uniform(9.0, 13.0) + 14.0 * radius
     lean, towards = lean_rad * math.sqrt(rng.random()), rng.uniform(0, 2 * math.pi)
     tilt = np.array([math.sin(lean) * math.cos(towards), math.sin(lean) * math.sin(towards), -math.cos(lean)])
-    base = np.array([x, y, 0.0])
+    # as deep as the ground lies on the lower side of the trunk
+    base = np.array([x, y, -min(ground.height_m(x + radius * n, y + radius * e) for n, e in _AROUND)])
     is_conifer = bool(rng.random() < world.conifers)
     number = int(rng.integers(0, 1 << 30))
     green = rng.uniform(0.55, 0.9) * np.array([0.8, 0.85, 0.6]) if is_conifer else _leaf_green(rng)
@@ -155,20 +131,21 @@ def _leaf_green(rng: np.random.Generator) -> Array:
 
 def forest_contents(world: ForestWorld, seed: int, light: Light, glades: Glades = ()) -> Contents:
     """Return trees and ground; no tree stands in a glade."""
-    trees = plant(world, seed, glades)
-    parts = [ground(world)]
-    solids: list[Solid] = []
+    land = lay(world.relief, seed)
+    standing = with_branches(plant_rows(world, seed) + plant(world, seed, glades), world.undergrowth, seed)
+    low = bushes(world.undergrowth, area_of(world), land, seed, (*_ends(world), *glades))
+    trees = standing + low
+    parts = [ground(world, land, light)]
     for i, tree in enumerate(trees):
         parts += tree_meshes(tree, i + 1, light)
-        solids.append(frustum_solid(tree.base, tree.top, tree.radius_m, tree.top_radius_m))
-        solids += [ellipsoid_solid(centre, radii) for centre, radii in tree.crowns()]
     across = (1.0 / _length(world), 1.0 / (2 * world.half_width_m))
     return Contents(
         meshes=tuple(parts),
-        solids=tuple(solids),
-        discs=tuple(tree.disc_at(MAP_HEIGHT_M) for tree in trees),
+        solids=tuple(solid for tree in trees for solid in tree.solids()),
+        discs=tuple(tree.disc_at(MAP_HEIGHT_M) for tree in trees if tree.height_m > MAP_HEIGHT_M),
         materials={"ground": Material("grass", (0.4, 0.4), "light_map", across)},
         textures={"light_map": light_map(world, trees, light, seed)},
+        ground=with_bushes(land, low),
     )
 
 
@@ -176,41 +153,35 @@ def _length(world: ForestWorld) -> float:
     return world.run_in_m + world.course_m + world.run_out_m
 
 
-def ground(world: ForestWorld) -> Mesh:
-    """Return the ground plane; its texture coordinates start at the corner of the planted area."""
-    x = np.array([-world.run_in_m - FAR_GROUND_M, world.course_m + world.run_out_m + FAR_GROUND_M])
-    y = np.array([-1.0, 1.0]) * (world.half_width_m + FAR_GROUND_M)
-    vertices, uv, _, triangles = meshes.terrain(x, y, np.zeros((2, 2)))
+def area_of(world: ForestWorld) -> Area:
+    """Return the planted area: x from, x to, y from, y to."""
+    return -world.run_in_m, world.course_m + world.run_out_m, -world.half_width_m, world.half_width_m
+
+
+def _ends(world: ForestWorld) -> Glades:
+    return (0.0, 0.0, world.clearing_m), (world.course_m, 0.0, world.clearing_m)
+
+
+def ground(world: ForestWorld, land: Ground, light: Light) -> Mesh:
+    """Return the ground; its texture coordinates start at the corner of the planted area."""
+    x0, x1, y0, y1 = area_of(world)
+    if land.level:
+        x, y = np.array([x0 - FAR_GROUND_M, x1 + FAR_GROUND_M]), np.array([y0 - FAR_GROUND_M, y1 + FAR_GROUND_M])
+    else:
+        x, y = _grid(x0, x1), _grid(y0, y1)
+    height = np.array([[land.height_m(north, east) for east in y.tolist()] for north in x.tolist()])
+    vertices, uv, normals, triangles = meshes.terrain(x, y, height)
     uv = uv + np.array([world.run_in_m, world.half_width_m])
-    return Mesh(vertices, uv, np.ones(len(vertices)), triangles, "ground", GROUND_OBJECT)
+    # what lies level has all of the sun that the light map leaves it
+    share = np.clip(normals @ light.direction / -light.direction[2], 0.0, 1.0)
+    return Mesh(vertices, uv, share, triangles, "ground", GROUND_OBJECT)
 
 
-def tree_meshes(tree: Tree, object_id: int, light: Light) -> list[Mesh]:
-    """Return trunk and foliage of one tree, coarser for greater distances."""
-    sun, parts = light.direction, []
-    bark: Bgr = (tree.tone, tree.tone, tree.tone)
-    for sides, span in TRUNK_SIDES:
-        vertices, uv, normals, triangles = meshes.frustum(
-            tree.base, tree.top, tree.radius_m, tree.top_radius_m, sides
-        )
-        share = np.clip(normals @ sun, 0.0, 1.0)
-        uv = uv + 7.0 * tree.turn_rad
-        parts.append(Mesh(vertices, uv, share, triangles, tree.bark, object_id, bark, draw_range_m=span))
-    return parts + [_foliage(tree, layer, object_id, sun) for layer in tree.species.layers]
-
-
-def _foliage(tree: Tree, layer: Layer, object_id: int, sun: Array) -> Mesh:
-    """Set one layer of the species on the tree; sun reaches around leaves."""
-    vertices, uv, normals, triangles = layer.surface
-    c, s = math.cos(tree.turn_rad), math.sin(tree.turn_rad)
-    sun_unit = np.array([c * sun[0] + s * sun[1], c * sun[1] - s * sun[0], sun[2]])
-    share = np.clip((normals @ sun_unit + 0.45) / 1.45, 0.0, 1.0)
-    depth = 0.7 if layer.dark else 1.0
-    tint: Bgr = (depth * tree.tint[0], depth * tree.tint[1], depth * tree.tint[2])
-    return Mesh(
-        tree.placed(vertices), uv * tree.width_m, share, triangles, "leaves1" if tree.conifer else "leaves0",
-        object_id, tint, 1.0, layer.two_sided, layer.loose, RANGES[layer.level],
-    )  # fmt: skip
+def _grid(low: float, high: float) -> Array:
+    """Grid lines, close where things stand and flights go."""
+    near = np.linspace(low, high, math.ceil((high - low) / GROUND_STEP_M) + 1)
+    far = np.linspace(0.0, FAR_GROUND_M, 8)[1:]
+    return np.concatenate([low - far[::-1], near, high + far])
 
 
 def light_map(world: ForestWorld, trees: list[Tree], light: Light, seed: int) -> textures.Texture:
@@ -222,13 +193,14 @@ def light_map(world: ForestWorld, trees: list[Tree], light: Light, seed: int) ->
     sun = light.direction
     slide = sun[:2] / sun[2]  # how far north and east a shadow falls per metre of height, since z points down
 
-    def pixel(p: Array) -> Array:
-        return np.asarray((p[:2] - p[2] * slide - origin) * scale)
+    def pixel(p: Array, foot: Array) -> Array:
+        """Where the shadow of a point falls, the ground taken as level from its tree's foot on."""
+        return np.asarray((p[:2] - (p[2] - foot[2]) * slide - origin) * scale)
 
     trunks = np.zeros((n, n), np.uint8)
     foliage = np.zeros((n, n), np.uint8)
     for tree in trees:
-        a, b = pixel(tree.base), pixel(tree.top)
+        a, b = pixel(tree.base, tree.base), pixel(tree.top, tree.base)
         side = np.array([-slide[1], slide[0]]) / np.hypot(*slide) * scale
         low, high = tree.radius_m * side, tree.top_radius_m * side
         corners = np.rint(16 * np.array([a + low, a - low, b - high, b + high]))
@@ -236,7 +208,7 @@ def light_map(world: ForestWorld, trees: list[Tree], light: Light, seed: int) ->
         for crown, radii in tree.crowns():
             along = math.hypot(radii[0], radii[2] * float(np.hypot(*slide)))
             axes = np.rint(16 * np.array([along, radii[1]]) * scale.mean()).astype(int)
-            centre = np.rint(16 * pixel(crown)).astype(int)
+            centre = np.rint(16 * pixel(crown, tree.base)).astype(int)
             angle = math.degrees(math.atan2(slide[1], slide[0]))
             cv2.ellipse(foliage, centre.tolist(), axes.tolist(), angle, 0, 360, 255, -1, cv2.LINE_AA, 4)
     leafy = _field(rng, n, n // 2, 1.2)

@@ -17,10 +17,10 @@ from morpheyes_daemon.simulation import meshes
 from morpheyes_daemon.simulation.meshes import Surface
 from morpheyes_daemon.transforms import Array
 
-CONIFERS, BROADLEAVES = 6, 10
+CONIFERS, BROADLEAVES, BUSHES = 6, 10, 6
 """How many different ones there are of each."""
 
-ASPECT = 8.0
+ASPECT, BUSH_ASPECT = 8.0, 2.4
 """Height over crown width that the unit shapes are made for, so that leaves come out about as wide as high."""
 
 
@@ -73,22 +73,36 @@ def broadleaf(number: int) -> Species:
         width = rng.uniform(0.6, 0.9)
         half = min(0.75 * width / ASPECT, up - low)
         crowns.append((out * math.cos(angle), out * math.sin(angle), up, width, width, half))
-    made = np.array(crowns)
-    # meshes are made in ned axes at ASPECT widths of height
-    centres = made[:, :3] * (1.0, 1.0, -ASPECT)
-    radii = made[:, 3:] * (1.0, 1.0, ASPECT)
+    return _leafy(rng, np.array(crowns), ASPECT, far_every=2)
+
+
+@cache
+def bush(number: int) -> Species:
+    """Return a bush of several round heads that reach down to the ground."""
+    rng = np.random.default_rng([number, 112])
+    crowns = [(0.0, 0.0, 0.5, 0.75, 0.75, 0.5)]
+    for k in range(3):
+        angle, top = 2 * math.pi * (k / 3 + 0.2 * rng.random()), rng.uniform(0.55, 0.9)
+        crowns.append((0.45 * math.cos(angle), 0.45 * math.sin(angle), top / 2, 0.55, 0.55, top / 2))
+    return _leafy(rng, np.array(crowns), BUSH_ASPECT, far_every=1)
+
+
+def _leafy(rng: np.random.Generator, made: Array, aspect: float, far_every: int) -> Species:
+    """Return foliage around ellipsoids; its meshes are made in ned axes at `aspect` widths of height."""
+    centres = made[:, :3] * (1.0, 1.0, -aspect)
+    radii = made[:, 3:] * (1.0, 1.0, aspect)
     pairs = list(zip(centres, radii, strict=True))
     bodies = [meshes.blob(rng, c, 0.85 * r, 1, 0.25) for c, r in pairs]
     cards = [meshes.leaf_cards(rng, c, r, 60, 0.24) for c, r in pairs]
     near = (
-        Layer(_unit(meshes.joined(bodies)), 0, dark=True),
-        Layer(_unit(meshes.joined(cards)), 0, loose=True, two_sided=True),
+        Layer(_unit(meshes.joined(bodies), aspect), 0, dark=True),
+        Layer(_unit(meshes.joined(cards), aspect), 0, loose=True, two_sided=True),
     )
-    middle = Layer(_unit(meshes.joined([meshes.blob(rng, c, r, 1, 0.35) for c, r in pairs])), 1)
-    far = Layer(_unit(meshes.joined([meshes.blob(rng, c, r, 0, 0.3) for c, r in pairs[::2]])), 2)
+    middle = Layer(_unit(meshes.joined([meshes.blob(rng, c, r, 1, 0.35) for c, r in pairs]), aspect), 1)
+    far = Layer(_unit(meshes.joined([meshes.blob(rng, c, r, 0, 0.3) for c, r in pairs[::far_every]]), aspect), 2)
     return Species(made, (*near, middle, far))
 
 
-def _unit(surface: Surface) -> Surface:
+def _unit(surface: Surface, aspect: float = ASPECT) -> Surface:
     vertices, uv, normals, triangles = surface
-    return vertices / (1.0, 1.0, -ASPECT), uv, normals, triangles
+    return vertices / (1.0, 1.0, -aspect), uv, normals, triangles

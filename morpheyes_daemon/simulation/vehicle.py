@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.simulation.ground import LEVEL, Ground
 from morpheyes_daemon.simulation.loiter_plant import GRAVITY_M_S2, LEAN_LAG_S, SecondOrder
 from morpheyes_daemon.simulation.wind import CALM, Wind, WindConditions
 from morpheyes_daemon.transforms import R_from_rpy, pose, wrap_rad
@@ -61,7 +62,7 @@ class Controls:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Where the vehicle really was at `t_ns`."""
+    """Where the vehicle really was at `t_ns`; `ground_m` is the height of the ground below it."""
 
     t_ns: int
     p_ned_m: tuple[float, float, float]
@@ -69,6 +70,7 @@ class Truth:
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
+    ground_m: float = 0.0
 
     @property
     def T_ned_frd(self) -> NDArray[np.float64]:
@@ -78,7 +80,7 @@ class Truth:
     @property
     def height_m(self) -> float:
         """Height over the ground."""
-        return -self.p_ned_m[2]
+        return -self.p_ned_m[2] - self.ground_m
 
 
 _Row = tuple[float, ...]
@@ -95,12 +97,15 @@ class Vehicle:
         seed: int = 0,
         start_ned_m: tuple[float, float] = (0.0, 0.0),
         yaw_rad: float = 0.0,
+        ground: Ground = LEVEL,
     ) -> None:
         self.airframe = airframe or Airframe()
         self.controls = Controls()
         self.wind = Wind(wind, seed)
         self.t_ns = 0
-        self.north_m, self.east_m, self.down_m = start_ned_m[0], start_ned_m[1], 0.0
+        self.ground = ground
+        self.north_m, self.east_m = start_ned_m
+        self.down_m = -ground.height_m(*start_ned_m)
         self.v_north_m_s = self.v_east_m_s = self.v_down_m_s = 0.0
         self.yaw_rad = yaw_rad
         self.heading = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -126,7 +131,18 @@ class Vehicle:
     @property
     def height_m(self) -> float:
         """Height over the ground."""
-        return -self.down_m
+        return -self.down_m - self.ground_m
+
+    @property
+    def ground_m(self) -> float:
+        """Height of the ground below, over the start of the course."""
+        return self.ground.height_m(self.north_m, self.east_m)
+
+    @property
+    def surface_m(self) -> float:
+        """Height of what is right below, ground or a bush, over the start of the course."""
+        below = self.ground.range_m((self.north_m, self.east_m, self.down_m), (0.0, 0.0, 1.0))
+        return -self.down_m - below
 
     @property
     def lean_rad(self) -> tuple[float, float]:
@@ -195,9 +211,10 @@ class Vehicle:
         self.north_m += self.v_north_m_s * STEP_S
         self.east_m += self.v_east_m_s * STEP_S
         self.down_m += self.v_down_m_s * STEP_S
-        self.on_ground = self.down_m >= 0.0 and self.v_down_m_s >= 0.0
+        floor = -self.ground_m
+        self.on_ground = self.down_m >= floor and self.v_down_m_s >= 0.0
         if self.on_ground:
-            self.down_m = 0.0
+            self.down_m = floor
             self._rest()
 
     def _record(self) -> None:
@@ -228,7 +245,8 @@ class Vehicle:
         a, b, part = before or after, after, steps - index
         mix = [x + (y - x) * part for x, y in zip(a, b, strict=True)]
         mix[8] = a[8] + wrap_rad(b[8] - a[8]) * part
-        return Truth(t_ns, (mix[0], mix[1], mix[2]), (mix[3], mix[4], mix[5]), *_attitude(*mix[6:]))
+        ground_m = self.ground.height_m(mix[0], mix[1])
+        return Truth(t_ns, (mix[0], mix[1], mix[2]), (mix[3], mix[4], mix[5]), *_attitude(*mix[6:]), ground_m)
 
 
 def _attitude(

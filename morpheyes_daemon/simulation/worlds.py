@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.errors import ConfigError
@@ -22,9 +22,10 @@ from morpheyes_daemon.simulation.collision import CollisionWorld, VehicleShape
 from morpheyes_daemon.simulation.contents import Contents, Disc, GapTruth
 from morpheyes_daemon.simulation.forest import ForestWorld, forest_contents
 from morpheyes_daemon.simulation.gap import GapWorld, gap_contents
+from morpheyes_daemon.simulation.ground import LEVEL, Ground, Relief
 from morpheyes_daemon.simulation.looks import materials_of, textures_of
 from morpheyes_daemon.simulation.room import LAMPS, Cube, RoomWorld, cube_contents, room_contents
-from morpheyes_daemon.simulation.scene import SKY_OBJECT, Light, Mesh, Scene
+from morpheyes_daemon.simulation.scene import SKY_OBJECT, Bgr, Light, Mesh, Scene
 from morpheyes_daemon.transforms import Array
 from morpheyes_daemon.yaml_source import load_model
 
@@ -42,8 +43,38 @@ class MixedWorld(Section):
     gap: GapWorld
     cube: Cube | None = None
 
+    @model_validator(mode="after")
+    def _level(self) -> MixedWorld:
+        if self.forest.relief != Relief():
+            raise ValueError("the ground of a mixed course must be level, since the wall stands on it")
+        return self
+
 
 AnyWorld = Annotated[ForestWorld | GapWorld | RoomWorld | MixedWorld, Field(discriminator="kind")]
+
+
+class Daylight(Section):
+    """Where the sun stands and how much of its light and the sky's comes through."""
+
+    sun_bearing_deg: float = Field(230.7, ge=-360, le=360, description="clockwise from the course")
+    sun_elevation_deg: float = Field(44.6, ge=10, le=90)
+    sun: float = Field(1.0, ge=0, le=3, description="times a clear day's")
+    sky: float = Field(1.0, ge=0.02, le=3, description="times a clear day's")
+    haze_range_m: float = Field(90.0, ge=10, le=1e4)
+    unsteady: float = Field(0.0, ge=0, le=0.9, description="by how much the exposure misses the light as clouds move")
+
+    def light(self) -> Light:
+        """Return it as the scene has it."""
+        up, towards = math.radians(self.sun_elevation_deg), math.radians(self.sun_bearing_deg)
+        clear = Light()
+        return Light(
+            (math.cos(up) * math.cos(towards), math.cos(up) * math.sin(towards), -math.sin(up)),
+            _times(clear.sun, self.sun), _times(clear.sky, self.sky), _times(clear.haze, self.sky), self.haze_range_m,
+        )  # fmt: skip
+
+
+def _times(colour: Bgr, factor: float) -> Bgr:
+    return colour[0] * factor, colour[1] * factor, colour[2] * factor
 
 
 class WorldFile(Section):
@@ -51,6 +82,7 @@ class WorldFile(Section):
 
     description: str = ""
     world: AnyWorld
+    light: Daylight | None = Field(None, description="out of doors; a clear day when left out")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +99,7 @@ class World:
     goal_ned_m: tuple[float, float, float] | None
     discs: tuple[Disc, ...] = ()
     gaps: tuple[GapTruth, ...] = ()
+    ground: Ground = LEVEL
 
     def to_goal_m(self, p_ned_m: Sequence[float]) -> float:
         """Return the horizontal distance from a place to the goal, 0 where there is none."""
@@ -97,16 +130,16 @@ def load_world(name: str) -> WorldFile:
 
 def build_world(file: WorldFile, seed: int) -> World:
     """Plant a world by its seed."""
-    world = file.world
+    world, light = file.world, Light() if file.light is None else file.light.light()
     match world:
         case ForestWorld():
-            return _world(forest_contents(world, seed, Light()), Light(), world.course_m)
+            return _world(forest_contents(world, seed, light), light, world.course_m)
         case GapWorld():
-            return _world(gap_contents(world, seed, Light()), Light(), _behind_wall_m(world))
+            return _world(gap_contents(world, seed, light), light, _behind_wall_m(world))
         case RoomWorld():
             return _world(room_contents(world, LAMPS, seed), LAMPS, None, with_sky=False)
         case MixedWorld():
-            return _world(_mixed(world, seed, Light()), Light(), world.forest.course_m)
+            return _world(_mixed(world, seed, light), light, world.forest.course_m)
 
 
 def _behind_wall_m(world: GapWorld) -> float:
@@ -129,8 +162,9 @@ def _world(contents: Contents, light: Light, goal_m: float | None, with_sky: boo
     )
     collisions = CollisionWorld(contents.solids, contents.obstacles)
     start = (0.0, 0.0, -FLYING_HEIGHT_M)
-    goal = None if goal_m is None else (goal_m, 0.0, -FLYING_HEIGHT_M)
-    return World(scene, collisions, start, goal, contents.discs, contents.gaps)
+    ground = contents.ground
+    goal = None if goal_m is None else (goal_m, 0.0, -FLYING_HEIGHT_M - ground.height_m(goal_m, 0.0))
+    return World(scene, collisions, start, goal, contents.discs, contents.gaps, ground)
 
 
 def sky_mesh() -> Mesh:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.messages import Pinhole
 from morpheyes_daemon.strategies.base import View
+from morpheyes_daemon.strategies.rise import ground_rise
 from morpheyes_daemon.transforms import R_FRD_CAM
 
 Floats = NDArray[np.float64]
@@ -67,7 +68,7 @@ BIN_RAD = math.radians(0.6)
 
 
 def obstacle_profile(view: View, band_m: float, trust_m: float, bin_rad: float = BIN_RAD) -> ObstacleProfile:
-    """Gather the obstacles within `band_m` above and below the vehicle into azimuth bins.
+    """Gather the obstacles within `band_m` above and below the way over the ground into azimuth bins.
 
     `trust_m` is how far depth is believed; obstacles beyond it are kept out.
     """
@@ -89,13 +90,17 @@ def obstacle_profile(view: View, band_m: float, trust_m: float, bin_rad: float =
     z0 = np.where(known, z, 0.0)
     down_m = T[2, 3] + z0 * directions[2] - view.vehicle.p_ned_m[2]
     range_m = z0 * horizontal
-    in_band = known & inside & (np.abs(down_m) <= band_m) & (range_m < min(trust_m, RANGE_EDGES_M[-1]))
+    points_m = np.stack([z0 * directions[0], z0 * directions[1], down_m])
+    rise = ground_rise(points_m[:, known & inside], _height_m(view))
+    climb_m = rise[0] * points_m[0] + rise[1] * points_m[1]
+    in_band = known & inside & (np.abs(down_m + climb_m) <= band_m) & (range_m < min(trust_m, RANGE_EDGES_M[-1]))
     counts = _count(index[in_band], range_m[in_band], bins)
     support = _support_needed(pinhole, stride, band_m, 2 * half_rad / bins)
     occupied = _smoothed(counts) >= support
 
     edge = math.atan2(band_m, max(1.0, min(trust_m, 8.0)))
-    level = inside & (np.abs(np.arctan2(directions[2], horizontal)) <= max(edge, 2 * stride / pinhole.f_px))
+    climb_rad = np.arctan((rise[0] * directions[0] + rise[1] * directions[1]) / horizontal)
+    level = inside & (np.abs(np.arctan2(directions[2], horizontal) + climb_rad) <= max(edge, 2 * stride / pinhole.f_px))
     looked = np.bincount(index[level], minlength=bins)
     matched = np.bincount(index[level & known], minlength=bins)
     too_near = np.bincount(index[level & depth.near[::stride, ::stride].ravel()], minlength=bins)
@@ -121,6 +126,12 @@ def obstacle_profile(view: View, band_m: float, trust_m: float, bin_rad: float =
         trust_m=trust_m,
         near_limit_m=depth.near_limit_m,
     )
+
+
+def _height_m(view: View) -> float:
+    """Height over the ground by the rangefinder, over the start where there is none."""
+    vehicle = view.vehicle
+    return vehicle.height_m if math.isfinite(vehicle.height_m) else -vehicle.p_ned_m[2]
 
 
 def wide_runs(flags: NDArray[np.bool_], least: int) -> NDArray[np.bool_]:

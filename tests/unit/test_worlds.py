@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.simulation.forest import ForestWorld, Tree, plant
+from morpheyes_daemon.simulation.forest import ForestWorld, plant
+from morpheyes_daemon.simulation.trees import Tree
 from morpheyes_daemon.simulation.worlds import build_world, load_world, world_names
 
 CONTROL_RADIUS_M = 0.17
