@@ -78,7 +78,9 @@ class Stage:
         self.world: World = build_world(file, seed)
         wind = WindConditions(scenario.wind_m_s, random.Random(f"wind from {seed}").uniform(-math.pi, math.pi))
         north, east, _ = self.world.start_ned_m
-        craft = Vehicle(wind=wind, seed=seed, start_ned_m=(north, east), ground=self.world.ground)
+        craft = Vehicle(
+            wind=wind, seed=seed, start_ned_m=(north, east), yaw_rad=self.world.heading_rad, ground=self.world.ground
+        )
         self.autopilot = AutopilotTwin(craft, clock, seed=seed)
         self.vehicle: FlyingVehicle = vehicle or self.autopilot
         self.radio = self.vehicle.radio

@@ -62,7 +62,7 @@ class FlightControl:
         self._moving: VelocityReference | None = None
         self._north, self._east = Tracking(), Tracking()
         self._climb_m_s = 0.0
-        self._height_m = self._surface_m = 0.0
+        self._height_m = self._surface_m = self._rise_m_s = 0.0
         self._takeoff_m: float | None = None
         self._phase = Phase.CLIMB
         self._phase_s = 0.0
@@ -117,7 +117,7 @@ class FlightControl:
 
     def _start_vertical(self) -> None:
         self._climb_m_s = -self._vehicle.v_down_m_s
-        self._surface_m = self._vehicle.surface_m
+        self._surface_m, self._rise_m_s = self._vehicle.surface_m, 0.0
         self._height_m = -self._vehicle.down_m - self._surface_m
 
     def step(self, pilot: PilotInput) -> None:
@@ -209,9 +209,11 @@ class FlightControl:
         self._climb_m_s += change
         self._height_m += self._climb_m_s * STEP_S
         if self.settings.surface_tracking:
-            self._surface_m += (vehicle.surface_m - self._surface_m) * STEP_S / _SURFACE_TRACKING_S
+            rise_m_s = (vehicle.surface_m - self._surface_m) / _SURFACE_TRACKING_S
+            self._surface_m += rise_m_s * STEP_S
+            self._rise_m_s += max(-most, min(most, rise_m_s - self._rise_m_s))
         off_m = max(-1.0, min(1.0, self._height_m + self._surface_m + vehicle.down_m))
-        wanted = self._climb_m_s + _HEIGHT_P_1_S * off_m
+        wanted = self._climb_m_s + self._rise_m_s + _HEIGHT_P_1_S * off_m
         return change / STEP_S + _CLIMB_P_1_S * (wanted + vehicle.v_down_m_s)
 
     def _horizontal(self, pilot: PilotInput) -> tuple[float, float]:

@@ -56,6 +56,7 @@ class ForestWorld(Section):
     run_in_m: float = Field(15.0, ge=2, le=100, description="trees are planted this far behind the start")
     max_lean_deg: float = Field(2.0, ge=0, le=10)
     conifers: float = Field(0.4, ge=0, le=1, description="share of trees")
+    heading_deg: float = Field(0.0, ge=-180, le=180, description="of the vehicle at the start, from the course")
     undergrowth: Undergrowth = Undergrowth()
     relief: Relief = Relief()
     rows: tuple[tuple[float, float, float, float], ...] = Field(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -90,7 +90,8 @@ class World:
     """A planted world: what is seen, what is hit, where a flight starts and where it should end (ned).
 
     `discs` are trunks for the map, `gaps` the walls with openings. Where there is no place to reach (a room to watch
-    something in) the goal is None, and a flight is over when the mission says so.
+    something in) the goal is None, and a flight is over when the mission says so. `heading_rad` is the vehicle's at the
+    start.
     """
 
     scene: Scene
@@ -100,6 +101,7 @@ class World:
     discs: tuple[Disc, ...] = ()
     gaps: tuple[GapTruth, ...] = ()
     ground: Ground = LEVEL
+    heading_rad: float = 0.0
 
     def to_goal_m(self, p_ned_m: Sequence[float]) -> float:
         """Return the horizontal distance from a place to the goal, 0 where there is none."""
@@ -133,7 +135,8 @@ def build_world(file: WorldFile, seed: int) -> World:
     world, light = file.world, Light() if file.light is None else file.light.light()
     match world:
         case ForestWorld():
-            return _world(forest_contents(world, seed, light), light, world.course_m)
+            planted = _world(forest_contents(world, seed, light), light, world.course_m)
+            return replace(planted, heading_rad=math.radians(world.heading_deg))
         case GapWorld():
             return _world(gap_contents(world, seed, light), light, _behind_wall_m(world))
         case RoomWorld():

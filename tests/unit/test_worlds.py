@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.errors import ConfigError
+from morpheyes_daemon.simulation.collision import VehicleShape
 from morpheyes_daemon.simulation.forest import ForestWorld, plant
+from morpheyes_daemon.simulation.scene import Light
 from morpheyes_daemon.simulation.trees import Tree
-from morpheyes_daemon.simulation.worlds import build_world, load_world, world_names
+from morpheyes_daemon.simulation.worlds import Daylight, build_world, load_world, world_names
 
 CONTROL_RADIUS_M = 0.17
 """Footprint of the straight-line control run."""
@@ -106,4 +108,55 @@ def test_a_bad_world_file_names_line_and_key(tmp_path: Path) -> None:
         load_world(str(path))
     path.write_text("world:\n  kind: forest\n  radius_min_m: 0.3\n  radius_max_m: 0.2\n")
     with pytest.raises(ConfigError, match="radius_min_m"):
+        load_world(str(path))
+
+
+def test_bushes_stand_on_the_ground_and_can_be_hit() -> None:
+    file = load_world("forest_bushes")
+    world = build_world(file, 1)
+    assert world.ground.bushes is not None
+    x, y, z, _, _, up = world.ground.bushes[0]
+    assert -2.3 < z - up < -0.4
+    clearance = world.clearance_m(np.array([x, y, z]), np.eye(3), VehicleShape(), 0.2)
+    assert clearance < 0.0
+
+
+def test_trees_and_goal_of_a_slope_stand_on_it() -> None:
+    file = load_world("forest_slope")
+    world = build_world(file, 2)
+    assert isinstance(file.world, ForestWorld)
+    for tree in plant(file.world, 2)[:50]:
+        ground_m = world.ground.height_m(float(tree.base[0]), float(tree.base[1]))
+        # the foot is as deep as the lower side of the trunk
+        assert -0.3 * tree.radius_m - 1e-9 <= -tree.base[2] - ground_m <= 1e-9
+    assert world.goal_ned_m is not None
+    assert -world.goal_ned_m[2] == pytest.approx(1.5 + world.ground.height_m(80.0, 0.0))
+    ground = next(mesh for mesh in world.scene.meshes if mesh.material == "ground")
+    off = [-z - world.ground.height_m(x, y) for x, y, z in ground.vertices_m[::17].tolist()]
+    assert max(map(abs, off)) < 1e-9
+
+
+def test_nothing_passes_between_the_trunks_of_a_row() -> None:
+    world = build_world(load_world("forest_dead_end"), 0)
+    shape = VehicleShape()
+    places = (np.array([16.0, y, -1.5]) for y in np.arange(-5.0, 5.0, 0.05))
+    assert all(world.clearance_m(place, np.eye(3), shape, 0.1) < 0.0 for place in places)
+
+
+def test_the_sun_stands_where_the_file_says() -> None:
+    light = load_world("forest_light").light
+    assert light is not None
+    north, east, down = light.light().direction
+    assert math.degrees(math.atan2(east, north)) == pytest.approx(20.0)
+    assert math.degrees(math.asin(-down)) == pytest.approx(15.0)
+    clear = Daylight().light()
+    assert clear.direction == pytest.approx(Light().direction, abs=2e-3)
+    assert clear.sun == Light().sun
+
+
+def test_a_mixed_course_on_a_slope_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "hill.yaml"
+    forest = "{kind: forest, relief: {slope_deg: 5}}"
+    path.write_text(f"world: {{kind: mixed, forest: {forest}, gap: {{kind: gap}}}}", encoding="utf-8")
+    with pytest.raises(ConfigError, match="level"):
         load_world(str(path))
