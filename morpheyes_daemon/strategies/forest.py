@@ -24,6 +24,7 @@ from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, Strat
 from morpheyes_daemon.strategies.corridor import free_distance_m
 from morpheyes_daemon.strategies.memory import ObstacleMemory
 from morpheyes_daemon.strategies.profile import Floats, ObstacleProfile, obstacle_profile, wide_runs
+from morpheyes_daemon.strategies.way_around import WayAround
 from morpheyes_daemon.transforms import wrap_rad
 
 
@@ -104,6 +105,7 @@ class Forest(Strategy):
         self._best_m = math.inf
         self._detour_m = FIRST_DETOUR_M
         self._strayed_m = 0.0
+        self._around = WayAround()
         self._seq = 0
 
     def perceive(self, view: View) -> ObstacleProfile:
@@ -131,17 +133,21 @@ class Forest(Strategy):
             return self._stop(observation, Intent.DONE, Reason.GOAL_REACHED)
         obstacles = self._obstacles(profile, observation)
         goal_rad = math.atan2(to_goal[1], to_goal[0])
-        if self._astray(wrap_rad(goal_rad - vehicle.yaw_rad), distance_m, vehicle, dt_s):
+        off_goal_rad = wrap_rad(goal_rad - vehicle.yaw_rad)
+        around = self._around.update(distance_m, off_goal_rad, observation.now_ns)
+        if not around and self._astray(off_goal_rad, distance_m, vehicle, dt_s):
             return self._look(observation, profile.near_limit_m, dt_s)
         choice = self._choose(profile, obstacles, observation, goal_rad, distance_m)
         if choice is None:
-            self._start_looking(1.0 if _right_is_freer(profile) else -1.0, math.inf)
+            right = self._around.side < 0 if around else _right_is_freer(profile)
+            self._start_looking(1.0 if right else -1.0, math.inf)
             return self._look(observation, profile.near_limit_m, dt_s)
         return self._fly(choice, obstacles, observation, dt_s, distance_m)
 
     def _settle(self, vehicle: VehicleState) -> None:
         """Before the mission engages: goal and height follow the vehicle, and what the climb showed is forgotten."""
         self._memory.clear()
+        self._around.reset()
         goal = self.parameters.goal
         cos, sin = math.cos(vehicle.yaw_rad), math.sin(vehicle.yaw_rad)
         self._goal_ned_m = (
@@ -190,6 +196,9 @@ class Forest(Strategy):
                 break
         else:
             return None
+        if self._around.side:
+            best = self._around.heading(headings, free)
+            return float(headings[best]), half_width, float(free[best])
         clipped_goal = _clip(goal_rad, headings)
         capped = np.minimum(free, max(distance_m, 1.0))
         off_goal = np.abs(_wrapped(headings - goal_rad))
@@ -200,9 +209,9 @@ class Forest(Strategy):
         weight = self._weight(z_goal, observation.reserve_m) if z_goal < min(reach, distance_m) else 0.0
         heading = clipped_goal + weight * wrap_rad(free_rad - clipped_goal)
         z_close = float(free_distance_m(obstacles, np.array([heading]), half_width, reach)[0])
-        best = float(free_distance_m(obstacles, np.array([free_rad]), half_width, reach)[0])
-        if z_close < min(need, best):
-            heading, z_close = free_rad, best
+        z_free = float(free_distance_m(obstacles, np.array([free_rad]), half_width, reach)[0])
+        if z_close < min(need, z_free):
+            heading, z_close = free_rad, z_free
         return heading, half_width, z_close
 
     def _weight(self, z_close_m: float, reserve_m: float) -> float:
