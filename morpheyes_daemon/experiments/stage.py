@@ -14,6 +14,7 @@ from typing import Protocol
 
 from morpheyes_daemon.clock import MS, Clock, S
 from morpheyes_daemon.config import NoServoConfig, VehicleConfig
+from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.messages import RawPair
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
@@ -76,6 +77,8 @@ class Stage:
         self.clock = clock
         file = load_world(scenario.world)
         self.world: World = build_world(file, seed)
+        if vehicle is not None and not self.world.ground.level:
+            raise ConfigError(f"The world {scenario.world} is not level, and a SITL knows no hills; choose another.")
         wind = WindConditions(scenario.wind_m_s, random.Random(f"wind from {seed}").uniform(-math.pi, math.pi))
         north, east, _ = self.world.start_ned_m
         craft = Vehicle(
