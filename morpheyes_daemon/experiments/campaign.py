@@ -142,7 +142,9 @@ def _cell(mode: str, rows: Sequence[Row], variable: dict[int, Row]) -> Row:
     causes: dict[str, int] = {}
     for row in rows:
         if row["outcome"] != "reached":
-            cause = f"{row['outcome']}: {row['reason']}" if row["outcome"] != "collided" else "collided"
+            # no two collisions are alike
+            which = f"collided in seed {row['seed']}" if row["outcome"] == "collided" else row["outcome"]
+            cause = f"{which}: {row['reason']}"
             causes[cause] = causes.get(cause, 0) + 1
     return {
         "baseline_mode": mode,
@@ -201,8 +203,7 @@ def _fly_all(
         return folder / f"{mode}-{seed}" if seed == campaign.seeds[0] and scheduler is None else None
 
     calls = [
-        joblib.delayed(fly_one)(_plan(campaign, mode, seed), campaign.key, pictures(mode, seed))
-        for mode, seed in pairs
+        joblib.delayed(fly_one)(_plan(campaign, mode, seed), campaign.key, pictures(mode, seed)) for mode, seed in pairs
     ]
     if not calls:
         return

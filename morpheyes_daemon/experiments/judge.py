@@ -113,7 +113,9 @@ class Judge:
     def _decide(self, now_ns: int) -> tuple[Outcome, str] | None:
         state, reason = self._guardian.state, self._guardian.reason
         if self._clearance_m < 0.0:
-            return Outcome.COLLIDED, f"hull or bar {-self._clearance_m * 1e3:.0f} mm into an obstacle"
+            v = self._stage.truth(now_ns).v_ned_m_s
+            depth, speed = -self._clearance_m * 1e3, math.hypot(*v)
+            return Outcome.COLLIDED, f"hull or bar {depth:.0f} mm into an obstacle at {speed:.1f} m/s, {state}"
         if self._height_m <= SKIDS_M and state is State.ENGAGED:
             return Outcome.COLLIDED, "the ground touched in flight"
         if self._engaged_ns and now_ns - self._engaged_ns > self._limit_s * S:

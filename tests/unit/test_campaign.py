@@ -109,9 +109,9 @@ def test_a_cell_says_why_flights_failed() -> None:
     usual = {"mean_speed_m_s": 2.0, "peak_speed_m_s": 3.0, "time_s": 40.0, "min_clearance_m": 0.5, "braking_events": 0}
     rows = [
         {**usual, "baseline_mode": "variable", "seed": 0, "outcome": "reached", "reason": ""},
-        {**usual, "baseline_mode": "variable", "seed": 1, "outcome": "collided", "reason": ""},
+        {**usual, "baseline_mode": "variable", "seed": 1, "outcome": "collided", "reason": "bar"},
         {**usual, "baseline_mode": "variable", "seed": 2, "outcome": "aborted", "reason": "depth_stale"},
     ]
     (cell,) = cells(rows)
     assert (cell["flights"], cell["reached"], cell["collided"]) == (3, 1, 1)
-    assert cell["causes"] == {"collided": 1, "aborted: depth_stale": 1}
+    assert cell["causes"] == {"collided in seed 1: bar": 1, "aborted: depth_stale": 1}
