@@ -34,7 +34,10 @@ class FlightControl:
     ) -> tuple[Sticks, Governed]:
         """Return the sticks for a command and what the governor made of its speed."""
         height_m = height_above_ground_m(vehicle, now_ns)
-        command = replace(command, v_ned_m_s=self._line.wanted_velocity(command, vehicle, now_ns))
+        quick = command.line is not None and command.line.integral_1_s2 > 0.0
+        steadied = self._velocity.steadied(vehicle, now_ns)
+        felt = steadied if quick else vehicle
+        command = replace(command, v_ned_m_s=self._line.wanted_velocity(command, felt, now_ns))
         governed = self._governor.limit(command, summary, vehicle, self.model, height_m, now_ns)
         north, east, down = command.v_ned_m_s
         scale = min(1.0, governed.limit_m_s / governed.wanted_m_s) if governed.wanted_m_s > 0.0 else 0.0
@@ -43,9 +46,9 @@ class FlightControl:
             (north * scale, east * scale, down),
             command.yaw_rad,
             command.height_m,
-            vehicle,
+            felt,
             command.coast,
-            quick=command.line is not None and command.line.integral_1_s2 > 0.0,
+            quick=quick,
         )
         return self._reined(sticks, governed, vehicle, height_m), governed
 

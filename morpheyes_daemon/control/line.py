@@ -18,6 +18,9 @@ CLIMB_MOST_M_S = 0.5
 LEAN_LAG_S = 0.15
 """A wanted velocity takes hold so much later (VelocityTuning.lean_lag_s)."""
 
+ANSWER_S = 0.2
+"""Where the vehicle will be after this is what is held against the line: without it the way back overshoots."""
+
 MISSED_MOST_M_S = 0.4
 """A lateral wind of 3 m/s takes less from Loiter's speed than this."""
 
@@ -48,6 +51,8 @@ class LineKeeper:
         missed = self._gathered(line, (north, east, down), now_ns)
         vn, ve, vd = command.v_ned_m_s
         gain = line.gain_1_s
+        north += ANSWER_S * (moving[0] - vehicle.v_ned_m_s[0])
+        east += ANSWER_S * (moving[1] - vehicle.v_ned_m_s[1])
         back = _across(
             (gain * north + missed[0] + moving[0], gain * east + missed[1] + moving[1]), (vn, ve), line.most_m_s
         )

@@ -7,7 +7,7 @@ bounds the lean, forwards and in braking, and does not know why a velocity is wa
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.control.loiter import LoiterModel
@@ -30,13 +30,15 @@ BRAKE_LEAN_RAD = math.radians(8.0)
 class VelocityTuning:
     """Gains and bounds; the defaults are tuned on the identified Loiter plant (tests/unit/test_velocity.py).
 
-    `quick_response_1_s` takes the place of `response_1_s` on a line, where what is missing is steered by often.
-    `lean_lag_s` is how far ahead velocity is predicted, about the delay of the lean. `brake_lean_rad` bounds the lean
-    against the motion while slowing down, `stop_lean_rad` while stopping (0: neutral sticks, Loiter brakes).
+    `quick_response_1_s` takes the place of `response_1_s` on a line, where what is missing is steered by often; there,
+    the measured velocity is steadied over `steady_s`. `lean_lag_s` is how far ahead velocity is predicted, about the
+    delay of the lean. `brake_lean_rad` bounds the lean against the motion while slowing down, `stop_lean_rad` while
+    stopping (0: neutral sticks, Loiter brakes).
     """
 
     response_1_s: float = 2.5
-    quick_response_1_s: float = 5.0
+    quick_response_1_s: float = 7.0
+    steady_s: float = 0.7
     integral_1_s2: float = 0.3
     integral_limit_m_s2: float = 0.8
     lean_lag_s: float = 0.15
@@ -69,12 +71,14 @@ class VelocityController:
         quick = PidGains(tuning.quick_response_1_s, tuning.integral_1_s2, i_limit=tuning.integral_limit_m_s2)
         self._calm, self._quick = (Pid(gains), Pid(gains)), (Pid(quick), Pid(quick))
         self._felt: Vector2 = (0.0, 0.0)
+        self._steady: Vector2 | None = None
         self._last_ns = 0
 
     def reset(self) -> None:
         """Forget the integrals and what was commanded."""
         self._forget()
         self._felt = (0.0, 0.0)
+        self._steady = None
         self._last_ns = 0
 
     def _forget(self) -> None:
@@ -108,6 +112,25 @@ class VelocityController:
         return Sticks(
             now_ns, expires_ns, roll_us, pitch_us, self.model.throttle.width_us(climb), self.model.yaw_us(rate)
         )
+
+    def steadied(self, vehicle: VehicleState, now_ns: int) -> VehicleState:
+        """Return the state now, its horizontal velocity by Loiter's law on what was commanded, drawn to the measured.
+
+        Call once before every `step`. The noise of a measured velocity alone takes a line 17 mm off.
+        """
+        above_m = height_above_ground_m(vehicle, now_ns)
+        age_s = max(0.0, min(0.2, (now_ns - vehicle.position_t_ns) / S))
+        dt_s = min(0.1, max(0.0, (now_ns - self._last_ns) / S)) if self._last_ns else 0.0
+        share = 1.0 - math.exp(-dt_s / self.tuning.steady_s)
+        steady = []
+        for axis, felt in enumerate(self._felt):
+            measured = vehicle.v_ned_m_s[axis]
+            v = self._steady[axis] if self._steady else measured
+            v += dt_s * (felt - self.model.drag_m_s2(v, above_m))
+            ahead = age_s * (felt - self.model.drag_m_s2(measured, above_m))
+            steady.append(v + share * (measured + ahead - v))
+        self._steady = (steady[0], steady[1])
+        return replace(vehicle, v_ned_m_s=(*self._steady, vehicle.v_ned_m_s[2]), position_t_ns=now_ns)
 
     def _push(
         self,

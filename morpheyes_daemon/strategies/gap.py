@@ -10,6 +10,7 @@ stretch, where the edges have left the view, is flown on the opening's track.
 from __future__ import annotations
 
 import math
+from collections import deque
 from enum import StrEnum
 
 import numpy as np
@@ -19,6 +20,7 @@ from morpheyes_daemon.control.baseline import baseline_for
 from morpheyes_daemon.messages import Intent, Line, MissionCommand
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, View
+from morpheyes_daemon.strategies.gap_crossing import Crossing
 from morpheyes_daemon.strategies.gap_parameters import GapParameters
 from morpheyes_daemon.strategies.gap_percept import GapPercept, gap_percept
 from morpheyes_daemon.strategies.gap_track import Motion, PointTrack
@@ -36,11 +38,17 @@ class Phase(StrEnum):
     OVER = "over"
 
 
-RANGE_SIGMA: Array = np.array([0.006, 0.006, 0.010])
-"""One sigma of where an opening is seen along, across and down, per metre of range: a pixel, and the attitude."""
+RANGE_SIGMA: Array = np.array([0.010, 0.003, 0.003])
+"""One sigma of where an opening is seen along, across and down, per metre of range: a pixel."""
+
+ATTITUDE_LATE_S = 0.02
+"""An attitude's stamp may be late by this, which counts while the vehicle turns or nods."""
 
 YAW_SIGMA: Array = np.full(3, 0.02)
 """One sigma of a wall's heading, radians."""
+
+YAW_WALK_RAD_S = 0.002
+"""And how that seems to wander, radians per root second."""
 
 SURE_SCALE = 0.02
 """Lengths are taken from depth only when the baseline is known this well; while the eyes move they are not."""
@@ -63,13 +71,7 @@ STAND_M = 0.35
 TURNED_RAD = math.radians(3.0)
 SETTLED_M = 0.004
 
-SLOW_M_S, TURNS_RAD = 0.2, math.radians(9.0)
-"""A moving opening is crossed where it turns back, and while the wall stands across the way."""
-
-GATHER_S = 0.75
-"""What gathering speed costs in time."""
-
-HOLD_1_S, RUN_1_S, RUN_1_S2 = 0.6, 3.5, 1.5
+HOLD_1_S, RUN_1_S, RUN_1_S2 = 0.6, 4.0, 0.5
 """Gains on what is missing to the line and, on the run, on its integral.
 
 Gentle before the wall, since a vehicle that brakes looks up."""
@@ -91,10 +93,11 @@ class Gap(Strategy):
         super().__init__(parameters, craft)
         self._phase = Phase.APPROACH
         self._track = PointTrack()
-        self._yaw = PointTrack()
+        self._yaw = PointTrack(walk_m_s=YAW_WALK_RAD_S)
         self._room: list[float] = []
         self._chosen: Opening | None = None
-        self._beyond_m = 0.0
+        self._beyond_m: deque[float] = deque(maxlen=2)
+        self._crossing = Crossing(parameters)
         self._yaw_rad = 0.0
         self._height_m = math.nan
         self._settled_ns = 0
@@ -131,7 +134,8 @@ class Gap(Strategy):
         """Before the mission engages: forget what the climb showed."""
         self._phase = Phase.APPROACH
         self._yaw_rad = observation.vehicle.yaw_rad
-        self._track, self._yaw, self._room, self._chosen = PointTrack(self._yaw_rad), PointTrack(), [], None
+        self._track, self._yaw = PointTrack(self._yaw_rad), PointTrack(walk_m_s=YAW_WALK_RAD_S)
+        self._room, self._chosen, self._crossing = [], None, Crossing(self.parameters)
         self._settled_ns = self._seen_ns = observation.now_ns
 
     def _take_in(self, percept: GapPercept, observation: Observation) -> None:
@@ -151,17 +155,20 @@ class Gap(Strategy):
         opening, place = (found, found.places[0]) if isinstance(found, Opening) else found
         self._chosen = opening
         self._seen_ns = percept.t_ns
-        self._beyond_m = opening.beyond_m
+        self._beyond_m.append(opening.beyond_m)
         p = self._scaled(np.array(place.p_ned_m), percept)
-        self._track.see(percept.t_ns, p, RANGE_SIGMA * max(0.5, opening.z_m))
-        if self._phase is not Phase.RUN or self._track.moves:
+        _, nods, turns = observation.at_exposure.rates_frd_rad_s
+        sigma = np.hypot(RANGE_SIGMA, ATTITUDE_LATE_S * np.array([0.0, turns, nods]))
+        self._track.see(percept.t_ns, p, sigma * max(0.5, opening.z_m), opening.z_m)
+        if self._phase is not Phase.RUN:
             heading = np.array([0.0, wrap_rad(percept.yaw_rad - self._yaw_rad), 0.0])
             self._yaw.see(percept.t_ns, heading, YAW_SIGMA)
         measures = self._phase is Phase.APPROACH and opening.z_m < 1.2 * self.parameters.stand_off_m
         if measures and sure:
             self._room = [*self._room[-30:], place.clearance_m]
         if self._phase in (Phase.APPROACH, Phase.CLOSE) and self._track.spread_m(3.0) > MOVES_M:
-            self._track.moves = self._yaw.moves = True
+            self._track.move()
+            self._yaw.move()
 
     def _scaled(self, p_ned_m: Array, percept: GapPercept) -> Array:
         """Return where the opening was seen; with the eyes under way only the direction, at the range known before."""
@@ -203,7 +210,7 @@ class Gap(Strategy):
                 why = "no opening in the wall" if percept.bimodal else "the depth has no two clusters"
                 return self._command(observation, Intent.REFUSE, Reason.MISSION_REFUSED, text=why)
             return self._nearer(observation)
-        opening, ahead = self._track.at(now_ns), self._ahead()
+        ahead, opening = self._ahead(), self._awaited(now_ns)
         range_m = float((opening.p_m - np.array(vehicle.p_ned_m)) @ ahead)
         start = opening.p_m - parameters.stand_off_m * ahead
         if observation.engaged and self._stands(observation, start, ahead):
@@ -213,7 +220,6 @@ class Gap(Strategy):
                 self._phase = Phase.CLOSE
             elif self._phase is Phase.CLOSE and self._closed(observation) and self._may_run(observation):
                 self._phase = Phase.RUN
-                self._track.near()
                 return self._run(observation)
         return self._hold(observation, opening, start, ahead, range_m)
 
@@ -276,22 +282,21 @@ class Gap(Strategy):
         return float(np.median(recent)) >= self.parameters.margin_m
 
     def _may_run(self, observation: Observation) -> bool:
-        """A standing opening at once; a moving one after it was watched, when it will be slow at the crossing."""
-        if not self._track.moves:
-            return True
+        """A standing opening at once; a moving one when it will be slow, and the wall across, on arriving."""
         now_ns = observation.now_ns
-        watched_s = (now_ns - self._settled_ns) / S
-        if watched_s < self.parameters.watch_s:
-            return False
-        crossing_ns = now_ns + round(self._run_s() * S)
-        fast = float(np.linalg.norm(self._track.at(crossing_ns).v_m_s))
-        turned = abs(float(self._yaw.at(crossing_ns).p_m[1] - self._yaw.middle[1]))
-        patience = 1.0 + max(0.0, watched_s - 2 * self.parameters.watch_s) / self.parameters.watch_s
-        return fast < patience * SLOW_M_S and turned < patience * TURNS_RAD
+        return not self._track.moves or self._crossing.due(self._track, self._yaw, self._watched_s(now_ns), now_ns)
 
-    def _run_s(self) -> float:
-        """Time from the stand-off to the wall: the set speed, reached with about the lean that Loiter gives it."""
-        return self.parameters.stand_off_m / self.parameters.speed_m_s + GATHER_S
+    def _awaited(self, now_ns: int) -> Motion:
+        """Return the opening as it is waited for: where it is or, when it sways, where it will be crossed."""
+        if self._track.wave is None:
+            self._crossing.t_ns = now_ns + self._crossing.run_ns
+            return self._track.at(now_ns)
+        watched_s = self._watched_s(now_ns)
+        self._crossing.plan(self._track, self._yaw, watched_s, now_ns)
+        return Motion(self._crossing.waiting_place(self._track, watched_s), np.zeros(3), np.zeros(3), 0.0)
+
+    def _watched_s(self, now_ns: int) -> float:
+        return (now_ns - self._settled_ns) / S
 
     def _refuse(self, observation: Observation) -> MissionCommand:
         need, chosen = self.silhouette, self._chosen
@@ -307,8 +312,8 @@ class Gap(Strategy):
     def _run(self, observation: Observation) -> MissionCommand:
         """Through the opening; broken off while it can still stop before the wall and the opening is lost."""
         parameters, vehicle, now_ns = self.parameters, observation.vehicle, observation.now_ns
-        opening, ahead = self._track.at(now_ns), self._ahead()
-        range_m = float((opening.p_m - np.array(vehicle.p_ned_m)) @ ahead)
+        ahead = self._ahead()
+        range_m = float((self._track.at(now_ns).p_m - np.array(vehicle.p_ned_m)) @ ahead)
         if range_m < -parameters.behind_m:
             self._phase = Phase.BEHIND
             return self._stop_behind(observation)
@@ -317,11 +322,12 @@ class Gap(Strategy):
         if stoppable and (lost or not self._fits()):
             self._phase = Phase.CLOSE
             return self._approach(observation)
-        beyond_m = range_m + self._beyond_m
+        beyond_m = range_m + self._seen_beyond_m
         v = parameters.speed_m_s * ahead
-        line = Line(
-            now_ns, _three(opening.p_m), _three(opening.v_m_s), _three(opening.a_m_s2), RUN_1_S, RUN_1_S2
-        )  # fmt: skip
+        after_s = self._crossing.to_wall_s(range_m, float(np.array(vehicle.v_ned_m_s) @ ahead))
+        opening = self._track.at(now_ns + round(after_s * S))
+        place = opening.p_m - after_s * opening.v_m_s  # a straight way that meets it as it moves then
+        line = Line(now_ns, _three(place), _three(opening.v_m_s), gain_1_s=RUN_1_S, integral_1_s2=RUN_1_S2)
         return self._command(
             observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(), v_ned_m_s=_three(v),
             clear_m=max(0.0, beyond_m - NOSE_M), z_m=beyond_m, contour_m=range_m,
@@ -333,6 +339,11 @@ class Gap(Strategy):
             self._phase = Phase.OVER
             return self._command(observation, Intent.DONE, Reason.GOAL_REACHED)
         return self._command(observation, Intent.STOP, None)
+
+    @property
+    def _seen_beyond_m(self) -> float:
+        """Room behind the wall: what one frame alone takes for an obstacle there is not believed."""
+        return max(self._beyond_m, default=0.0)
 
     def _ahead(self) -> Array:
         yaw_rad = self._heading_rad()
@@ -392,7 +403,7 @@ class Gap(Strategy):
             "room_m": self._room[-1] if self._room else math.nan,
             "opening_width_m": chosen.width_m,
             "opening_height_m": chosen.height_m,
-            "beyond_m": self._beyond_m,
+            "beyond_m": self._seen_beyond_m,
         }
 
 

@@ -1,7 +1,9 @@
 """Where an opening is now and will be: its place over some seconds, in the autopilot's local frame.
 
-A standing opening seems to drift, since the autopilot's position does; a moving one sways. Both are one Kalman filter
-per opening, and where some seconds show that the motion repeats itself, a wave fitted to them, which leads farther.
+A standing opening seems to drift, since the autopilot's position does; a moving one sways, and where some seconds show
+that the motion repeats itself, a wave is fitted to it, which leads farther. Where it is seen is off in proportion to
+its range, because the eyes' axis on the body is known to half a degree and the attitude errs; a Kalman filter tells
+that from the place as the range shrinks.
 """
 
 from __future__ import annotations
@@ -18,18 +20,23 @@ from morpheyes_daemon.transforms import Array
 POSITION_WALK_M_S = 0.025
 """Random walk of where an opening seems to be, metres per root second: the autopilot's own position drifts by 0.02."""
 
-MOVING_M_S2 = 0.4
-"""Acceleration of a moving wall that the filter reckons with."""
+POINTING_RAD, POINTING_WALK_RAD_S = 0.008, 0.004
+"""One sigma of the eyes' direction on the body, which no board tells, and its walk per root second: the attitude's."""
 
-DRIFT_M_S, DRIFTING_M_S2 = 0.03, 0.03
-"""How fast a standing opening seems to drift: half a degree aside at 3 m/s is 0.026 m/s."""
+MOVING_M_S, MOVING_M_S2 = 0.5, 0.4
+"""Speed and acceleration of a moving wall that the filter reckons with."""
 
 KEEP_S = 14.0
 LEAST_WAVE_S = 3.0
 PERIODS_S = np.geomspace(2.5, 16.0, 48)
-WAVE_MEMORY_S, LATELY_S = 5.0, 0.4
-WAVE_FITS_M = 0.06
-"""A wave is believed when it leaves this little (rms) of what was seen."""
+POINTING_S = 1.0
+"""For so long an attitude errs to the same side."""
+
+WAVE_MOST_M = 3.0
+"""One sigma of a wave's amplitude before anything is seen."""
+
+WAVE_FITS_M, LATELY_S = 0.10, 5.0
+"""A wave is believed when it leaves this little (rms) of what was seen lately, drift of some seconds included."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,22 +49,33 @@ class Motion:
     sigma_m: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """One sight of the point: place (3,) and one sigma (3,) along, across and down, and the range it was seen from."""
+
+    t_ns: int
+    p_m: Array
+    sigma_m: Array
+    range_m: float
+
+
 class PointTrack:
     """A point seen now and then, each axis filtered for itself; times must not go back.
 
-    Axes are along (x), across (y) and down (z) for a heading: a wall moves across and down, never along.
+    Axes are along (x), across (y) and down (z) for a heading: a wall moves across and down, never along. The state of
+    each is place, velocity and pointing error.
     """
 
-    def __init__(self, yaw_rad: float = 0.0) -> None:
+    def __init__(self, yaw_rad: float = 0.0, walk_m_s: float = POSITION_WALK_M_S) -> None:
+        self._walk_m_s = walk_m_s
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         self._R_ned_wall: Array = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        self._seen: deque[tuple[int, Array]] = deque()
-        self._x: Array = np.zeros((3, 2))
-        self._P: Array = np.zeros((3, 2, 2))
+        self._seen: deque[Sighting] = deque()
+        self._x: Array = np.zeros((3, 3))
+        self._P: Array = np.zeros((3, 3, 3))
         self._t_ns = 0
         self._wave: Wave | None = None
-        self._accel_m_s2: float | None = None
-        self.moves = False
+        self._moves = False
 
     @property
     def count(self) -> int:
@@ -69,23 +87,29 @@ class PointTrack:
         """The motion that repeats itself, None when there is none."""
         return self._wave
 
-    def see(self, t_ns: int, p_ned_m: Array, sigma_m: Array) -> None:
-        """Take in where it was seen, with one sigma (3,) along, across and down."""
-        p = self._R_ned_wall.T @ p_ned_m
-        if not self._seen:
-            self._x[:, 0] = p
-            self._P[:, 0, 0] = sigma_m**2
+    @property
+    def moves(self) -> bool:
+        """It is taken for one that moves; see `move`."""
+        return self._moves
+
+    def move(self) -> None:
+        """From now on it is one that moves."""
+        if not self._moves:
+            self._moves = True
+            self._P[1:, 1, 1] = MOVING_M_S**2
+
+    def see(self, t_ns: int, p_ned_m: Array, sigma_m: Array, range_m: float = 0.0) -> None:
+        """Take in where it was seen, with one sigma (3,) along, across and down, and from how far."""
+        sighting = Sighting(t_ns, self._R_ned_wall.T @ p_ned_m, sigma_m, range_m)
+        if self._seen:
+            self._filter(sighting)
         else:
-            self._x, self._P = self._carried(t_ns)
-            gain = self._P[:, :, 0] / (self._P[:, 0, 0] + sigma_m**2)[:, None]
-            self._x = self._x + gain * (p - self._x[:, 0])[:, None]
-            self._P = self._P - gain[:, :, None] * self._P[:, None, 0]
-        self._t_ns = t_ns
-        self._seen.append((t_ns, p))
-        while self._seen[0][0] < t_ns - KEEP_S * S:
+            self._begin(sighting)
+        self._seen.append(sighting)
+        while self._seen[0].t_ns < t_ns - KEEP_S * S:
             self._seen.popleft()
-        if self.moves:
-            self._wave = fit_wave(list(self._seen))
+        if self._moves:
+            self._wave = fit_wave(list(self._seen), self._walk_m_s)
 
     def at(self, t_ns: int) -> Motion:
         """Return where it is, or will be, at a time."""
@@ -97,33 +121,52 @@ class PointTrack:
         R = self._R_ned_wall
         return Motion(R @ p, R @ v, R @ a, sigma_m)
 
+    def _begin(self, sighting: Sighting) -> None:
+        """Start at a sighting: what it is off by its pointing error is as unknown as that."""
+        r = sighting.range_m
+        self._x = np.zeros((3, 3))
+        self._x[:, 0] = sighting.p_m
+        self._P = np.zeros((3, 3, 3))
+        self._P[:, 0, 0] = sighting.sigma_m**2
+        self._P[1:] += POINTING_RAD**2 * np.array([[r * r, 0.0, -r], [0.0, 0.0, 0.0], [-r, 0.0, 1.0]])
+        self._t_ns = sighting.t_ns
+
+    def _filter(self, sighting: Sighting) -> None:
+        self._x, self._P = self._carried(sighting.t_ns)
+        H = np.array([[1.0, 0.0, 0.0]] + 2 * [[1.0, 0.0, sighting.range_m]])
+        PH = np.einsum("kij,kj->ki", self._P, H)
+        gain = PH / (np.einsum("ki,ki->k", H, PH) + sighting.sigma_m**2)[:, None]
+        off = sighting.p_m - np.einsum("ki,ki->k", H, self._x)
+        self._x = self._x + gain * off[:, None]
+        self._P = self._P - gain[:, :, None] * PH[:, None, :]
+        self._t_ns = sighting.t_ns
+
     def _carried(self, t_ns: int) -> tuple[Array, Array]:
         dt = max(0.0, (t_ns - self._t_ns) / S)
-        noise = np.zeros((3, 2, 2))
-        noise[:, 0, 0] = POSITION_WALK_M_S**2 * dt
-        F = np.array([np.eye(2)] * 3)
-        accel_m_s2 = MOVING_M_S2 if self.moves else self._accel_m_s2
-        if accel_m_s2 is not None:
+        noise = np.zeros((3, 3, 3))
+        noise[:, 0, 0] = self._walk_m_s**2 * dt
+        noise[1:, 2, 2] = POINTING_WALK_RAD_S**2 * dt
+        F = np.array([np.eye(3)] * 3)
+        if self._moves:
             F[1:, 0, 1] = dt
-            noise[1:] += accel_m_s2**2 * np.array([[dt**4 / 4, dt**3 / 2], [dt**3 / 2, dt**2]])
+            push = MOVING_M_S2 * np.array([dt * dt / 2, dt, 0.0])
+            noise[1:] += np.outer(push, push)
         return np.einsum("kij,kj->ki", F, self._x), np.asarray(F @ self._P @ F.transpose(0, 2, 1) + noise)
-
-    def near(self) -> None:
-        """From now on a standing point is flown at: what an eye that looks aside makes it drift by is followed."""
-        if self._accel_m_s2 is None:
-            self._accel_m_s2 = DRIFTING_M_S2
-            self._P[1:, 1, 1] = DRIFT_M_S**2
 
     @property
     def middle(self) -> Array:
         """Where it is on the average, along, across and down: the middle of its wave, or the mean of what was seen."""
         if self._wave is not None:
             return self._wave.centre
-        return np.mean([p for _, p in self._seen], axis=0) if self._seen else np.zeros(3)
+        return np.mean([seen.p_m for seen in self._seen], axis=0) if self._seen else np.zeros(3)
+
+    def middle_ned(self) -> Array:
+        """Return the place in ned that it sways about."""
+        return np.asarray(self._R_ned_wall @ np.array([self._x[0, 0], *self.middle[1:]]))
 
     def spread_m(self, last_s: float) -> float:
         """Return how far apart the places of the last seconds lie, across, 10th to 90th percentile."""
-        recent = np.array([p[1] for t, p in self._seen if t > self._t_ns - last_s * S])
+        recent = np.array([seen.p_m[1] for seen in self._seen if seen.t_ns > self._t_ns - last_s * S])
         if len(recent) < 8:
             return 0.0
         low, high = np.percentile(recent, [10.0, 90.0])
@@ -146,44 +189,54 @@ class Wave:
         phase = self.rate_rad_s * (t_ns - self.t0_ns) / S
         s, c, w = math.sin(phase), math.cos(phase), self.rate_rad_s
         swing = self.sine * s + self.cosine * c
-        still = np.array([0.0, 1.0, 1.0])
-        v = w * (self.sine * c - self.cosine * s)
-        return Motion(self.centre + swing, still * v, -w * w * still * swing, self.rms_m)
+        return Motion(self.centre + swing, w * (self.sine * c - self.cosine * s), -w * w * swing, self.rms_m)
 
 
-def fit_wave(seen: list[tuple[int, Array]]) -> Wave | None:
-    """Return the wave through places (t_ns, p (3,)), None when they are too few or do not repeat.
+def fit_wave(seen: list[Sighting], walk_m_s: float) -> Wave | None:
+    """Return the wave through what was seen, None when that is too little or does not repeat.
 
-    Linear least squares for each of some periods, the best of them refined once; the newest places count most. The
-    autopilot's position drifts meanwhile, so the wave is then shifted onto the last places.
+    Generalised least squares for each of some periods, the best of them refined twice. What was seen errs by its own
+    sigma, by the drift of the autopilot's position since, and by its range times a pointing error, one part of which
+    stays and is fitted, while the other comes and goes (an Ornstein-Uhlenbeck process).
     """
-    t0_ns = seen[-1][0]
-    t = np.array([(t_ns - t0_ns) / S for t_ns, _ in seen])
+    t0_ns = seen[-1].t_ns
+    t = np.array([(sighting.t_ns - t0_ns) / S for sighting in seen])
     if len(t) < 10 or -t[0] < LEAST_WAVE_S:
         return None
-    p = np.array([place for _, place in seen])
-    weight = np.exp(t / WAVE_MEMORY_S)
-    longest_s = 1.6 * float(-t[0])
-    periods = PERIODS_S[longest_s >= PERIODS_S]
+    p, r = np.array([sighting.p_m for sighting in seen]), np.array([sighting.range_m for sighting in seen])
+    sigma_m = np.array([sighting.sigma_m[1:].max() for sighting in seen])
+    white = np.linalg.inv(np.linalg.cholesky(_covariance(t, r, sigma_m, walk_m_s)))
+    periods = PERIODS_S[-1.6 * t[0] >= PERIODS_S]
     if not periods.size:
         return None
-    fits = [_harmonic(t, p, weight, 2 * math.pi / period) for period in periods]
-    best = int(np.argmin([cost for cost, _ in fits]))
-    fine = np.linspace(periods[max(0, best - 1)], periods[min(len(periods) - 1, best + 1)], 9)
-    fits = [_harmonic(t, p, weight, 2 * math.pi / period) for period in fine]
-    best = int(np.argmin([cost for cost, _ in fits]))
-    rms_m, x = fits[best]
-    if rms_m > WAVE_FITS_M:
-        return None
-    rate = 2 * math.pi / float(fine[best])
-    off = p - np.stack([np.ones_like(t), np.sin(rate * t), np.cos(rate * t)], axis=1) @ x
-    lately = np.exp(t / LATELY_S)
-    return Wave(t0_ns, rate, x[0] + lately @ off / lately.sum(), x[1], x[2], rms_m)
+    for _ in range(3):
+        fits = [_harmonic(t, r, p, white, 2 * math.pi / period) for period in periods]
+        best = int(np.argmin([cost for cost, _ in fits]))
+        rate, x = 2 * math.pi / float(periods[best]), fits[best][1]
+        periods = np.linspace(periods[max(0, best - 1)], periods[min(len(periods) - 1, best + 1)], 9)
+    off, weight = (p - _columns(t, r, rate) @ x)[:, 1:], np.exp(t / LATELY_S)[:, None] ** 2
+    rms_m = math.sqrt(float((off**2 * weight).sum() / weight.sum()))
+    return Wave(t0_ns, rate, x[0], _STILL * x[1], _STILL * x[2], rms_m) if rms_m < WAVE_FITS_M else None
 
 
-def _harmonic(t: Array, p: Array, weight: Array, rate: float) -> tuple[float, Array]:
-    A = np.stack([np.ones_like(t), np.sin(rate * t), np.cos(rate * t)], axis=1)
-    normal = (A * weight[:, None] ** 2).T
-    x = np.linalg.solve(normal @ A + 1e-6 * np.eye(3), normal @ p)
-    off = ((A @ x - p)[:, 1:] * weight[:, None]) ** 2
-    return math.sqrt(float(off.sum() / (weight**2).sum())), np.asarray(x)
+_STILL: Array = np.array([0.0, 1.0, 1.0])
+"""A wall does not move along."""
+
+
+def _covariance(t: Array, r: Array, sigma_m: Array, walk_m_s: float) -> Array:
+    """Return (n, n) how what was seen at times t <= 0 from ranges r errs together."""
+    drift = walk_m_s**2 * np.minimum(-t[:, None], -t[None, :])
+    pointing = POINTING_S / 2 * POINTING_WALK_RAD_S**2 * np.exp(-np.abs(t[:, None] - t[None, :]) / POINTING_S)
+    return np.asarray(drift + pointing * r[:, None] * r[None, :] + np.diag(sigma_m**2 + 1e-8))
+
+
+def _columns(t: Array, r: Array, rate: float) -> Array:
+    return np.stack([np.ones_like(t), np.sin(rate * t), np.cos(rate * t), r], axis=1)
+
+
+def _harmonic(t: Array, r: Array, p: Array, white: Array, rate: float) -> tuple[float, Array]:
+    """Return the cost across and down and (4, 3) centre, sine, cosine and pointing error of one rate's wave."""
+    A, y = white @ _columns(t, r, rate), white @ p
+    prior = np.array([0.0, WAVE_MOST_M, WAVE_MOST_M, POINTING_RAD])
+    x = np.linalg.solve(A.T @ A + np.diag([0.0, *prior[1:] ** -2.0]), A.T @ y)
+    return float(((y - A @ x)[:, 1:] ** 2).sum() + (x[3, 1:] ** 2).sum() / POINTING_RAD**2), np.asarray(x)

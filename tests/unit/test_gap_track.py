@@ -1,11 +1,11 @@
-"""A standing opening is averaged, a swaying one is led."""
+"""A standing opening is averaged, a swaying one is led, and what the eyes point aside by is told from its place."""
 
 import math
 
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.gap_track import PointTrack, fit_wave
+from morpheyes_daemon.strategies.gap_track import POSITION_WALK_M_S, PointTrack, Sighting, fit_wave
 
 S = 1_000_000_000
 SIGMA = np.full(3, 0.02)
@@ -19,8 +19,21 @@ def watched(where, seconds, noise_m=0.02, moves=False, yaw_rad=0.0):
     track, rng = PointTrack(yaw_rad), np.random.default_rng(0)
     for k in range(round(5 * seconds)):
         track.see(k * S // 5, where(k / 5) + rng.normal(0.0, noise_m, 3), SIGMA)
-        track.moves = moves
+        if moves:
+            track.move()
     return track, (round(5 * seconds) - 1) / 5
+
+
+def flown_at(where, aside_rad, moves=False):
+    """Watched from 4 m for ten seconds, then closed in on at 3 m/s to 1 m, by eyes that point aside and down."""
+    track, rng = PointTrack(), np.random.default_rng(3)
+    for k in range(56):
+        t_s, range_m = k / 5, min(4.0, 4.0 - 3.0 * (k / 5 - 10.0))
+        off = np.array([0.0, aside_rad * range_m, -aside_rad * range_m]) + rng.normal(0.0, 0.002 * range_m, 3)
+        track.see(k * S // 5, where(t_s) + off, np.full(3, 0.003 * range_m), range_m)
+        if moves:
+            track.move()
+    return track, 11.0
 
 
 def test_a_standing_point_is_known_better_than_it_is_seen():
@@ -31,6 +44,13 @@ def test_a_standing_point_is_known_better_than_it_is_seen():
     assert track.spread_m(3.0) < 0.1
 
 
+def test_eyes_that_point_aside_are_found_out_as_the_range_shrinks():
+    place = np.array([4.0, 0.2, -1.5])
+    track, t_s = flown_at(lambda _: place, 0.008)
+    # what the last sight, from 1 m, shows is 8 mm off, the mean of all 31 mm
+    assert track.at(round(t_s * S)).p_m[1:] == pytest.approx(place[1:], abs=0.004)
+
+
 def test_a_wave_is_led_by_two_seconds():
     track, t_s = watched(sway, 9.0, moves=True)
     assert track.wave is not None
@@ -38,6 +58,18 @@ def test_a_wave_is_led_by_two_seconds():
     # half a second of a 0.5 m/s wall would be 0.25 m
     assert ahead.p_m[1:] == pytest.approx(sway(t_s + 2.0)[1:], abs=0.04)
     assert ahead.v_m_s[1] == pytest.approx(0.5 * math.cos(t_s + 2.7), abs=0.06)
+
+
+def test_a_swaying_point_is_led_by_eyes_that_point_aside():
+    track, t_s = flown_at(sway, 0.008, moves=True)
+    # 0.4 s on: from the last sight to the wall
+    assert track.at(round((t_s + 0.4) * S)).p_m[1:] == pytest.approx(sway(t_s + 0.4)[1:], abs=0.012)
+
+
+def test_a_moving_point_without_a_wave_is_led_by_its_speed():
+    track, t_s = watched(lambda t: np.array([4.0, 0.4 * t, -1.5]), 2.4, noise_m=0.005, moves=True)
+    assert track.wave is None
+    assert track.at(round((t_s + 0.5) * S)).p_m[1] == pytest.approx(0.4 * (t_s + 0.5), abs=0.06)
 
 
 def test_a_moving_point_wanders_more_than_a_standing_one():
@@ -56,5 +88,6 @@ def test_a_wall_never_moves_along():
 
 def test_jumping_about_is_no_wave():
     rng = np.random.default_rng(1)
-    assert fit_wave([(k * S // 5, rng.normal(0.0, 0.4, 3)) for k in range(40)]) is None
-    assert fit_wave([(k * S // 5, sway(k / 5)) for k in range(5)]) is None
+    jumps = [Sighting(k * S // 5, rng.normal(0.0, 0.4, 3), SIGMA, 4.0) for k in range(40)]
+    assert fit_wave(jumps, POSITION_WALK_M_S) is None
+    assert fit_wave([Sighting(k * S // 5, sway(k / 5), SIGMA, 4.0) for k in range(5)], POSITION_WALK_M_S) is None

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morpheyes_daemon.control.line import CLIMB_MOST_M_S, LEAN_LAG_S, MISSED_MOST_M_S, LineKeeper
+from morpheyes_daemon.control.line import ANSWER_S, CLIMB_MOST_M_S, LEAN_LAG_S, MISSED_MOST_M_S, LineKeeper
 from morpheyes_daemon.messages import Intent, Line, MissionCommand, VehicleState
 
 S = 1_000_000_000
@@ -39,8 +39,15 @@ def test_a_point_is_held_when_no_speed_is_asked():
 
 def test_a_moving_line_is_led_by_the_lag_of_the_lean():
     line = Line(0, (7.0, 0.0, -1.5), (0.0, 0.4, 0.0), (0.0, 0.2, 0.0), gain_1_s=1.0)
-    vehicle = VehicleState(p_ned_m=(0.0, 0.4 + 0.1, -1.5))
-    assert wanted_velocity(command(line), vehicle, S)[1] == pytest.approx(0.4 + 0.2 * (1.0 + LEAN_LAG_S))
+    moving = 0.4 + 0.2 * (1.0 + LEAN_LAG_S)
+    vehicle = VehicleState(p_ned_m=(0.0, 0.4 + 0.1, -1.5), v_ned_m_s=(3.0, moving, 0.0))
+    assert wanted_velocity(command(line), vehicle, S)[1] == pytest.approx(moving)
+
+
+def test_on_its_way_back_it_is_held_against_where_it_will_be():
+    line, back = Line(0, (7.0, 0.0, -1.5), gain_1_s=2.0), (3.0, -0.3, 0.0)
+    vehicle = VehicleState(p_ned_m=(1.0, 0.2, -1.5), v_ned_m_s=back)
+    assert wanted_velocity(command(line), vehicle, 0)[1] == pytest.approx(-2.0 * (0.2 - 0.3 * ANSWER_S))
 
 
 def test_what_stays_missing_is_asked_for_more_and_more():
