@@ -119,3 +119,8 @@ def wall_time_s() -> float:
 def stopwatch_s() -> float:
     """Return a high-resolution reading for measuring how long a computation takes."""
     return time.perf_counter()
+
+
+def processor_s() -> float:
+    """Return the processor time of this process: what a computation costs whatever else the machine does."""
+    return time.process_time()

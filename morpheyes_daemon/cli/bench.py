@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from morpheyes_daemon.cli.bench_gap import gap, gap_images
+from morpheyes_daemon.cli.figures import say, times_text
 from morpheyes_daemon.cli.progress import progress_line
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.experiments.bench_vision import Times
     from morpheyes_daemon.experiments.flight import FlightPlan, Progress
 
 app = typer.Typer(help="Time the sticks, the depth and the renderer on this machine.", no_args_is_help=True)
@@ -52,7 +51,7 @@ def sticks(
         ("loop lateness", f"{found.worst_lateness_ms:.1f} ms at worst"),
         ("at the end", found.final_state),
     ]
-    _say(asdict(found), rows, as_json)
+    say(asdict(found), rows, as_json)
     if found.p99_s > LIMIT_P99_S or found.max_s > LIMIT_MAX_S:
         raise typer.Exit(1)
 
@@ -83,7 +82,7 @@ def soak(
         ("worker restarts", str(found.worker_restarts)),
         ("stick interval", f"p99 {found.p99_s * 1e3:.1f} ms, largest {found.max_s * 1e3:.1f} ms"),
     ]
-    _say(found.as_json(), rows, as_json)
+    say(found.as_json(), rows, as_json)
     leaked = max(found.leaked_tasks, found.leaked_threads, found.leaked_descriptors)
     if found.memory_growth_pct >= LIMIT_GROWTH_PCT or leaked > 0:
         raise typer.Exit(1)
@@ -101,11 +100,11 @@ def depth(
         found = bench_depth(plan, repeats, report)
     rows = [
         ("images", f"{found.size}, {found.disparities} disparities"),
-        ("depth map", _times(found.depth)),
-        ("StereoSGBM", _times(found.opencv)),
+        ("depth map", times_text(found.depth)),
+        ("StereoSGBM", times_text(found.opencv)),
         ("ratio", f"{found.ratio:.2f} of the medians"),
     ]
-    _say(asdict(found), rows, as_json)
+    say(asdict(found), rows, as_json)
 
 
 @app.command()
@@ -119,11 +118,11 @@ def latency(
     with progress_line() as report:
         found = bench_latency(plan, repeats, report)
     rows = [
-        ("frame to percept", _times(found.latency)),
-        ("of that computing", _times(found.compute)),
+        ("frame to percept", times_text(found.latency)),
+        ("of that computing", times_text(found.compute)),
         ("configured", f"{found.configured_ms:g} ms (stereo.latency_ms)"),
     ]
-    _say(asdict(found), rows, as_json)
+    say(asdict(found), rows, as_json)
 
 
 @app.command()
@@ -147,7 +146,7 @@ def takeover(
         ("message to release", f"{found.arrival_to_release_max_ms:.1f} ms at most"),
         *((f"{way} to release", _hand(times)) for way, times in found.hand_to_release_ms.items()),
     ]
-    _say(asdict(found), rows, as_json)
+    say(asdict(found), rows, as_json)
     if found.failed:
         raise typer.Exit(1)
 
@@ -160,7 +159,7 @@ def render(size: Size = "640x480", repeats: Repeats = 20, as_json: AsJson = Fals
     plan = _plan(size, "exact", 5.0, 1.0)
     with progress_line() as report:
         found = bench_render(plan, repeats, report)
-    _say({"size": size, **asdict(found)}, [("stereo pair", _times(found))], as_json)
+    say({"size": size, **asdict(found)}, [("stereo pair", times_text(found))], as_json)
 
 
 def _plan(size: str, calibration: str, rate_hz: float, minutes: float) -> FlightPlan:
@@ -185,11 +184,6 @@ def _live(quiet: bool, run: Callable[[Callable[[Progress], None]], Any]) -> Any:
         return run(line.show)
 
 
-def _times(times: Times) -> str:
-    p95, most = f"p95 {times.p95_ms:.1f} ms", f"largest {times.max_ms:.1f} ms"
-    return f"{times.median_ms:.1f} ms median, {p95}, {most} of {times.repeats}"
-
-
 def _hand(times: dict[str, float]) -> str:
     if not times["count"]:
         return "never"
@@ -199,11 +193,3 @@ def _hand(times: dict[str, float]) -> str:
 
 def _beat(p50_s: float, p99_s: float, max_s: float) -> str:
     return f"{p50_s * 1e3:.1f} ms median, p99 {p99_s * 1e3:.1f} ms, largest {max_s * 1e3:.1f} ms"
-
-
-def _say(document: dict[str, Any], rows: list[tuple[str, str]], as_json: bool) -> None:
-    if as_json:
-        typer.echo(json.dumps(document, indent=2))
-        return
-    for name, value in rows:
-        typer.echo(f"{name:>18}  {value}")

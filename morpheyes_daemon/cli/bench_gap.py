@@ -10,6 +10,8 @@ from typing import Annotated
 
 import typer
 
+from morpheyes_daemon.cli.figures import say, times_text
+
 
 def gap(
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "640x480",
@@ -18,7 +20,6 @@ def gap(
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON and nothing else.")] = False,
 ) -> None:
     """Time gap detection on one core, with and without depth, beside a detector by stacked optical flow."""
-    from morpheyes_daemon.cli.bench import _say, _times
     from morpheyes_daemon.cli.extras import require_simulator
     from morpheyes_daemon.cli.progress import progress_line
 
@@ -31,13 +32,14 @@ def gap(
         found = bench_gap(plan, repeats, report)
     rows = [
         ("images", f"{found.size}, {found.views} views"),
-        ("detection", _times(found.detection)),
-        ("depth", _times(found.depth)),
-        ("by stacked flow", _times(found.flow)),
+        ("detection", times_text(found.detection)),
+        ("of the processor", times_text(found.detection_cpu)),
+        ("depth", times_text(found.depth)),
+        ("by stacked flow", times_text(found.flow)),
         ("ratio", f"{found.ratio:.0f} without the depth, {found.ratio_with_depth:.1f} with it"),
         ("contour IoU", f"{found.contour_iou:.3f}; by flow {found.flow_iou:.3f} (medians)"),
     ]
-    _say(asdict(found), rows, as_json)
+    say(asdict(found), rows, as_json)
 
 
 def gap_images(

@@ -10,6 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from morpheyes_daemon.experiments.campaign import Row
+    from morpheyes_daemon.experiments.flight import FlightPlan
 
 
 def command(
@@ -65,18 +66,21 @@ def command(
             report(f"{plan.mission_name} flights", have, total)
 
         rows = run_campaign(campaign, folder, jobs, scheduler, done)
-    found, text = _tabled(plan.mission.strategy, rows, folder)
+    found, text = _tabled(plan, rows, folder)
     result = {"flights": rows, "cells": found}
     (folder / "results.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     (folder / "table.md").write_text(text + "\n", encoding="utf-8")
     typer.echo(json.dumps(result, indent=2) if as_json else f"{text}\n\n{folder}/results.json")
 
 
-def _tabled(strategy: str, rows: list[Row], folder: Path) -> tuple[list[Row], str]:
+def _tabled(plan: FlightPlan, rows: list[Row], folder: Path) -> tuple[list[Row], str]:
     """Return the cells of a campaign and the table that its field reports them in; figures go to `folder`."""
+    strategy = plan.mission.strategy
     if strategy == "gap":
+        from morpheyes_daemon.experiments.gap_figure import draw_sequences
         from morpheyes_daemon.experiments.gap_table import gap_cells, gap_table
 
+        draw_sequences(folder / "sequences.png", plan, rows)
         return (found := gap_cells(rows)), gap_table(found)
     if strategy == "imo":
         from morpheyes_daemon.experiments.imo_table import draw_trajectories, imo_cells, imo_table

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from morpheyes_daemon.clock import S, VirtualClock, VirtualLoop, stopwatch_s
+from morpheyes_daemon.clock import S, VirtualClock, VirtualLoop, processor_s, stopwatch_s
 from morpheyes_daemon.experiments.bench_vision import WARM_UP, Report, Times
 from morpheyes_daemon.experiments.flight import FlightPlan
 from morpheyes_daemon.experiments.flow_gap import STACK, flow_gap, stacked_flow
@@ -39,6 +39,7 @@ STEP_M = 0.04
 class GapBench:
     """Times of detection on one depth image, of the depth itself, and of the flow detector on its stack.
 
+    `detection_cpu` is what detection takes of the processor, which other work on the machine does not lengthen.
     `ratio` is the flow's median over detection's, `ratio_with_depth` over detection and depth together; the IoUs are
     medians against the truth over the views.
     """
@@ -46,6 +47,7 @@ class GapBench:
     size: str
     views: int
     detection: Times
+    detection_cpu: Times
     depth: Times
     flow: Times
     ratio: float
@@ -73,7 +75,7 @@ class GapBencher:
         size = (plan.config.camera.width_px, plan.config.camera.height_px)
         self._estimator = DepthEstimator(RigModel.load(plan.calibration), plan.config.stereo, size)
         self._strategy = build_strategy(plan.mission, plan.config)
-        self.seconds: dict[str, list[float]] = {"detection": [], "depth": [], "flow": []}
+        self.seconds: dict[str, list[float]] = {"detection": [], "detection_cpu": [], "depth": [], "flow": []}
         self.ious: dict[str, list[float]] = {"detection": [], "flow": []}
 
     def run(self, view: GapView) -> None:
@@ -85,8 +87,9 @@ class GapBencher:
         depth = self._estimator.depth(view.frame, pair)
         self.seconds["depth"].append(stopwatch_s() - started_s)
         seen = View(depth, pair.left, pair.right, view.vehicle, self._strategy.craft.T_frd_rig)
-        started_s = stopwatch_s()
+        started_s, started_cpu_s = stopwatch_s(), processor_s()
         percept: GapPercept = self._strategy.perceive(seen)
+        self.seconds["detection_cpu"].append(processor_s() - started_cpu_s)
         self.seconds["detection"].append(stopwatch_s() - started_s)
         others = [rectified.pair(grey(image), grey(image))[0] for image in view.stack]
         started_s = stopwatch_s()
@@ -108,12 +111,14 @@ def bench_gap(plan: FlightPlan, repeats: int, report: Report) -> GapBench:
             report("gap views", k + 1, repeats + WARM_UP)
     finally:
         cv2.setNumThreads(threads)
-    detection, depth, flow = (Times.of(bencher.seconds[name][WARM_UP:]) for name in ("detection", "depth", "flow"))
+    names = ("detection", "detection_cpu", "depth", "flow")
+    detection, detection_cpu, depth, flow = (Times.of(bencher.seconds[name][WARM_UP:]) for name in names)
     camera = plan.config.camera
     return GapBench(
         f"{camera.width_px}x{camera.height_px}",
         repeats,
         detection,
+        detection_cpu,
         depth,
         flow,
         flow.median_ms / detection.median_ms,

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from morpheyes_daemon.app import Daemon
 from morpheyes_daemon.clock import S, wall_time_s
@@ -13,23 +16,43 @@ from morpheyes_daemon.messages import VehicleState
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import draw_map
-from morpheyes_daemon.recorder.pictures.scene import Disc, Scene
+from morpheyes_daemon.recorder.pictures.scene import Disc, Polygon, Scene
 from morpheyes_daemon.recorder.pictures.strips import draw_strips
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.series import FlightSeries
+from morpheyes_daemon.simulation.contents import GapTruth
 from morpheyes_daemon.simulation.worlds import World
 from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.transforms import inverse
 
 FILES = ("summary.json", "flight.mcap", "map.png", "strips.png", "flight.mp4")
 
 
-def scene_of(world: World) -> Scene:
-    """Return what the top view shows of a world."""
+def scene_of(world: World, t_s: float = 0.0) -> Scene:
+    """Return what the top view shows of a world at a time of its own."""
     return Scene(
         discs=tuple(Disc(disc.x_m, disc.y_m, disc.radius_m) for disc in world.discs),
+        polygons=tuple(piece for gap in world.gaps for piece in wall_plan(gap, t_s)),
         start_m=world.start_ned_m[:2],
         goal_m=world.goal_ned_m[:2] if world.goal_ned_m else None,
     )
+
+
+def wall_plan(gap: GapTruth, t_s: float) -> tuple[Polygon, ...]:
+    """Return a wall from above (north, east), cut open as wide as its openings are at half their height."""
+    ends = [-gap.half_width_m, gap.half_width_m]
+    for outline in gap.outlines:
+        middle = 0.5 * (outline[:, 1].min() + outline[:, 1].max())
+        above = outline[:, 1] < middle
+        y0, z0, y1, z1 = np.hstack([outline, np.roll(outline, -1, axis=0)])[above != np.roll(above, -1)].T
+        ends += (y0 + (y1 - y0) * (middle - z0) / (z1 - z0)).tolist()
+    ends.sort()
+    T, half = gap.T_ned_wall(t_s), gap.thickness_m / 2
+    pieces = []
+    for left, right in zip(ends[::2], ends[1::2], strict=True):
+        corners = np.array([(-half, left), (-half, right), (half, right), (half, left)])
+        pieces.append(tuple((float(x), float(y)) for x, y in corners @ T[:2, :2].T + T[:2, 3]))
+    return tuple(pieces)
 
 
 class FlightOutputs:
@@ -42,6 +65,8 @@ class FlightOutputs:
         self._recorder: Recorder | None = None
         self._film: FlightFilm | None = None
         self._scene = Scene()
+        self._stage: Stage | None = None
+        self._through_s: float | None = None
 
     def watch(self, watchers: Watchers) -> None:
         """Have every frame filmed and every topic logged."""
@@ -52,6 +77,7 @@ class FlightOutputs:
         """Close log and film, draw the pictures, write the summary."""
         assert self._recorder is not None
         assert self._film is not None
+        assert self._stage is not None
         self._recorder.close()
         self._film.close()
         title = f"{summary.mission}, seed {summary.seed}, baseline {summary.baseline_mode}: {summary.outcome}"
@@ -60,7 +86,7 @@ class FlightOutputs:
         draw_map(
             self._folder / "map.png",
             self._series,
-            self._scene,
+            self._scene if self._through_s is None else scene_of(self._stage.world, self._through_s),
             self._plan.config.footprint,
             title=f"{title}, {figures}",
             collided=summary.outcome == "collided",
@@ -73,6 +99,7 @@ class FlightOutputs:
         for name in FILES:
             (self._folder / name).unlink(missing_ok=True)
         world, plan = stage.world, self._plan
+        self._stage = stage
         self._scene = scene_of(world)
         header = flight_header(
             mission=plan.mission_name,
@@ -100,4 +127,13 @@ class FlightOutputs:
         now_ns = stage.clock.now_ns()
         truth = self._series.truth
         if not truth or now_ns - truth[-1][0] >= S // 20:
-            self._series.add_truth(now_ns, stage.truth(now_ns).p_ned_m)
+            p_ned_m = stage.truth(now_ns).p_ned_m
+            self._series.add_truth(now_ns, p_ned_m)
+            self._note_wall(p_ned_m, stage, now_ns)
+
+    def _note_wall(self, p_ned_m: Sequence[float], stage: Stage, now_ns: int) -> None:
+        """Keep the time when the vehicle reaches a wall: on the map a wall that sways stands as it was then."""
+        t_s = stage.world_s(now_ns)
+        for gap in stage.world.gaps[:1]:
+            if self._through_s is None and (inverse(gap.T_ned_wall(t_s)) @ np.array([*p_ned_m, 1.0]))[0] > 0.0:
+                self._through_s = t_s

@@ -40,7 +40,10 @@ WHY = {
         "Differences: our fixed baselines run under the same speed governor as the variable one, so a baseline that "
         "sees badly makes the vehicle slow or stop, not crash; the paper held the speed and counted crashes."
     ),
-    "gap": "Success counts a crossing in which neither hull, bar nor propellers touch; touching by any of them fails.",
+    "gap": (
+        "Every opening is just large enough for the silhouette at a lean of 12° and 40 mm on every side; `small` ones "
+        "are to be refused. Success counts a crossing in which neither hull, bar nor propellers touch."
+    ),
     "imo": (
         "A detection counts only where this frame's own measurement lies within max(0.3 m, 5 %) of the visible face; "
         "predictions of the filter do not."

@@ -30,11 +30,15 @@ class Disc:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GapTruth:
-    """A wall with openings: outlines (n, 2) = y, z in the wall's frame, whose pose is `T_ned_wall(t_s)`."""
+    """A wall with openings: outlines (n, 2) = y, z in the wall's frame, whose pose is `T_ned_wall(t_s)`.
+
+    It reaches `half_width_m` to either side of its frame's middle.
+    """
 
     outlines: tuple[Array, ...]
     T_ned_wall: PoseAt
     thickness_m: float
+    half_width_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

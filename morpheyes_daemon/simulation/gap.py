@@ -70,7 +70,7 @@ def gap_truth(world: GapWorld, seed: int) -> GapTruth:
     """Return where the openings are and how the wall moves."""
     outlines, middle = _place(world, np.random.default_rng([seed, 500]), seed)
     T_ned_wall = swaying(world.motion, np.array([world.distance_m, middle, 0.0]), seed)
-    return GapTruth(outlines, T_ned_wall, world.thickness_mm / 1e3)
+    return GapTruth(outlines, T_ned_wall, world.thickness_mm / 1e3, world.half_width_m)
 
 
 def gap_contents(world: GapWorld, seed: int, light: Light) -> Contents:

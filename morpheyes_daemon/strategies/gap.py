@@ -147,7 +147,7 @@ class Gap(Strategy):
         if not whole or not (sure or self._track.count):
             return
         if self._phase is not Phase.RUN and percept.t_ns - self._seen_ns > FORGOTTEN_S * S:
-            self._track, self._room = PointTrack(self._yaw_rad), []
+            self._track, self._room, self._phase = PointTrack(self._yaw_rad), [], Phase.APPROACH
         roomiest = max(whole, key=lambda opening: opening.places[0].clearance_m)
         found = self._same(whole, percept.t_ns, sure) if self._track.count else roomiest
         if found is None:
@@ -320,7 +320,7 @@ class Gap(Strategy):
         lost = now_ns - self._seen_ns > LOST_S * S
         stoppable = range_m - NOSE_M > observation.reserve_m
         if stoppable and (lost or not self._fits()):
-            self._phase = Phase.CLOSE
+            self._phase, self._room = Phase.APPROACH, []
             return self._approach(observation)
         beyond_m = range_m + self._seen_beyond_m
         v = parameters.speed_m_s * ahead

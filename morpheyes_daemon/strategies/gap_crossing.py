@@ -21,6 +21,9 @@ SLOW_M_S, TURNS_RAD = 0.2, math.radians(9.0)
 HORIZON_S, STEP_S = 10.0, 0.1
 """So far ahead the crossing is looked for, in such steps."""
 
+EARLY_S, LATE_S = 0.15, 0.4
+"""A run that would arrive so much before or after the planned crossing may begin: the mission decides at each frame."""
+
 GATHER_S = 0.75
 """What gathering speed costs in time."""
 
@@ -35,17 +38,16 @@ class Crossing:
     def plan(self, track: PointTrack, yaw: PointTrack, watched_s: float, now_ns: int) -> None:
         """Keep to the crossing there is while it can still be reached and is slow; else take the slowest ahead."""
         earliest_ns = now_ns + self.run_ns
-        if self.t_ns < earliest_ns or self.haste(self.t_ns, track, yaw, watched_s) > 1.0:
+        if self.t_ns < earliest_ns - LATE_S * S or self.haste(self.t_ns, track, yaw, watched_s) > 1.0:
             times = [earliest_ns + round(step * S) for step in np.arange(0.0, HORIZON_S, STEP_S).tolist()]
             self.t_ns = min(times, key=lambda t_ns: self.haste(t_ns, track, yaw, watched_s))
 
     def due(self, track: PointTrack, yaw: PointTrack, watched_s: float, now_ns: int) -> bool:
         """Tell whether a run that begins now arrives at the crossing."""
-        earliest_ns = now_ns + self.run_ns
-        waits = self.t_ns - earliest_ns >= STEP_S * S
-        return watched_s > self.parameters.watch_s and not waits and self.haste(
-            earliest_ns, track, yaw, watched_s
-        ) <= 1.0  # fmt: skip
+        arrives_ns = now_ns + self.run_ns
+        if watched_s <= self.parameters.watch_s or self.t_ns - arrives_ns > EARLY_S * S:
+            return False
+        return self.haste(arrives_ns, track, yaw, watched_s) <= 1.0
 
     def waiting_place(self, track: PointTrack, watched_s: float) -> Array:
         """Return where (ned) the opening is to be waited for: while it is watched, the middle of its way.

@@ -146,8 +146,27 @@ def test_an_opening_lost_at_the_start_of_the_run_breaks_it_off():
     course.fly(14.0)
     assert Phase.RUN in course.phases
     after = course.phases[course.phases.index(Phase.RUN) :]
-    assert Phase.CLOSE in after
+    assert Phase.APPROACH in after
     assert course.vehicle.p_ned_m[0] < WALL_M
+
+
+def test_an_opening_forgotten_while_the_eyes_close_is_measured_anew():
+    hidden = []
+
+    def show(range_m):
+        closing = bool(course.phases) and course.phases[-1] is Phase.CLOSE
+        if (closing or hidden) and len(hidden) < 15:
+            hidden.append(range_m)
+            return []
+        return seen_from_afar(range_m)
+
+    course = Course(lambda range_m: [])
+    course.show = show
+    last = course.fly(40.0)
+    assert len(hidden) == 15
+    after = course.phases[course.phases.index(Phase.CLOSE) :]
+    assert after.index(Phase.APPROACH) < after.index(Phase.RUN)
+    assert last.intent is Intent.DONE
 
 
 def test_an_opening_that_is_cut_is_not_chosen():

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from morpheyes_daemon.config import Footprint, Mount
 from morpheyes_daemon.errors import ConfigError
+from morpheyes_daemon.experiments.flight_outputs import wall_plan
 from morpheyes_daemon.messages import Pinhole
 from morpheyes_daemon.simulation.collision import VehicleShape
 from morpheyes_daemon.simulation.gap import GapWorld, Opening
@@ -99,6 +100,17 @@ def test_an_opening_looks_as_it_is_judged() -> None:
     union = np.count_nonzero(hole | (inside > 0))
     # the far rim and the pixels along the outline differ
     assert np.count_nonzero(hole & (inside > 0)) / union > 0.9
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_on_the_map_the_wall_is_open_where_the_vehicle_passes(shape: Shape) -> None:
+    world = build_world(WorldFile(description="", world=GapWorld(kind="gap", openings=(Opening(shape=shape),))), 3)
+    pieces = [np.array(corners) for corners in wall_plan(world.gaps[0], 0.0)]
+    left, *_, right = sorted(pieces, key=lambda corners: float(corners[:, 1].min()))
+    assert left[:, 0] == pytest.approx([6.985, 6.985, 7.015, 7.015])
+    # 40 mm on both sides of a hull 337 mm wide; only at half the height of the opening, which may be elsewhere
+    assert right[:, 1].min() - left[:, 1].max() > 0.337
+    assert right[:, 1].max() - left[:, 1].min() == pytest.approx(8.0)
 
 
 @pytest.mark.parametrize("kind", ["periodic", "irregular"])

@@ -1,0 +1,74 @@
+"""A swaying opening is crossed where it turns back and stands across, and waited for where the run begins."""
+
+import math
+
+import numpy as np
+import pytest
+
+from morpheyes_daemon.strategies.gap_crossing import SLOW_M_S, TURNS_RAD, Crossing
+from morpheyes_daemon.strategies.gap_parameters import GapParameters
+from morpheyes_daemon.strategies.gap_track import PointTrack
+
+S = 1_000_000_000
+WATCHED_S, NOW_NS = 12.0, 12 * S
+SIGMA = np.full(3, 0.01)
+
+
+def tracks():
+    """An opening that sways by 0.5 m in a wall that turns, both watched for twelve seconds."""
+    place, yaw = PointTrack(), PointTrack(walk_m_s=0.002)
+    for track in (place, yaw):
+        track.move()
+    for k in range(61):
+        t_s = k / 5
+        place.see(k * S // 5, np.array([4.0, 0.5 * math.sin(t_s), -1.4 + 0.15 * math.cos(t_s)]), SIGMA, 4.0)
+        yaw.see(k * S // 5, np.array([0.0, math.radians(15) * math.sin(math.pi / 4 * t_s + 1.0), 0.0]), SIGMA)
+    return place, yaw
+
+
+def test_it_is_crossed_where_it_turns_back_and_the_wall_stands_across():
+    place, yaw = tracks()
+    crossing = Crossing(GapParameters())
+    crossing.plan(place, yaw, WATCHED_S, NOW_NS)
+    t_s = crossing.t_ns / S
+    # what is fitted to twelve seconds knows the speed to a few centimetres and the heading to a degree
+    assert math.hypot(0.5 * math.cos(t_s), 0.15 * math.sin(t_s)) < SLOW_M_S + 0.05
+    assert abs(math.radians(15) * math.sin(math.pi / 4 * t_s + 1.0)) < TURNS_RAD + 0.02
+    assert crossing.t_ns >= NOW_NS + crossing.run_ns
+
+
+def test_a_plan_is_kept_until_its_run_is_due():
+    place, yaw = tracks()
+    crossing = Crossing(GapParameters())
+    crossing.plan(place, yaw, WATCHED_S, NOW_NS)
+    planned_ns = crossing.t_ns
+    begins_ns = planned_ns - crossing.run_ns
+    assert not crossing.due(place, yaw, WATCHED_S, begins_ns - S // 2)
+    crossing.plan(place, yaw, WATCHED_S, begins_ns - S // 2)
+    assert crossing.t_ns == planned_ns
+    assert crossing.due(place, yaw, WATCHED_S, begins_ns)
+    assert not crossing.due(place, yaw, 2.0, begins_ns)
+
+
+def test_a_fast_moment_is_only_taken_after_long_waiting():
+    place, yaw = tracks()
+    crossing = Crossing(GapParameters())
+    middle_ns = round(4 * math.pi * S)
+    assert crossing.haste(middle_ns, place, yaw, WATCHED_S) > 2.0
+    assert crossing.haste(middle_ns, place, yaw, 60.0) < 1.0
+
+
+def test_it_waits_in_the_middle_and_then_where_a_straight_way_meets_the_opening():
+    place, yaw = tracks()
+    crossing = Crossing(GapParameters())
+    crossing.plan(place, yaw, WATCHED_S, NOW_NS)
+    assert crossing.waiting_place(place, 2.0)[1] == pytest.approx(0.0, abs=0.05)
+    begin, meeting = crossing.waiting_place(place, WATCHED_S), place.at(crossing.t_ns)
+    assert begin + crossing.run_ns / S * meeting.v_m_s == pytest.approx(meeting.p_m)
+
+
+def test_the_set_speed_is_gathered_on_the_way():
+    crossing = Crossing(GapParameters(speed_m_s=2.0))
+    assert crossing.to_wall_s(4.0, 2.0) == pytest.approx(2.0)
+    assert crossing.to_wall_s(4.0, 0.0) == pytest.approx(2.75)
+    assert crossing.to_wall_s(-0.1, 2.0) == 0.0
