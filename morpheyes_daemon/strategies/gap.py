@@ -22,9 +22,9 @@ from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, View
 from morpheyes_daemon.strategies.gap_crossing import Crossing
 from morpheyes_daemon.strategies.gap_parameters import GapParameters
-from morpheyes_daemon.strategies.gap_percept import GapPercept, gap_percept
+from morpheyes_daemon.strategies.gap_percept import GapPercept, gap_percept, tracked_place
 from morpheyes_daemon.strategies.gap_track import Motion, PointTrack
-from morpheyes_daemon.strategies.opening import Opening, Place, Silhouette
+from morpheyes_daemon.strategies.opening import Opening, Silhouette
 from morpheyes_daemon.transforms import Array, wrap_rad
 
 
@@ -52,12 +52,6 @@ YAW_WALK_RAD_S = 0.002
 
 SURE_SCALE = 0.02
 """Lengths are taken from depth only when the baseline is known this well; while the eyes move they are not."""
-
-SAME_M = 0.5
-"""An opening seen this near to where the tracked one should be is the same."""
-
-ALONG_SHARE = 0.4
-"""Of what counts across, along the way: range is seen worse."""
 
 FORGOTTEN_S = 2.0
 """Not seen for so long before the run: what is seen then is another opening."""
@@ -148,11 +142,14 @@ class Gap(Strategy):
             return
         if self._phase is not Phase.RUN and percept.t_ns - self._seen_ns > FORGOTTEN_S * S:
             self._track, self._room, self._phase = PointTrack(self._yaw_rad), [], Phase.APPROACH
-        roomiest = max(whole, key=lambda opening: opening.places[0].clearance_m)
-        found = self._same(whole, percept.t_ns, sure) if self._track.count else roomiest
+        if self._track.count:
+            found = tracked_place(whole, self._track.at(percept.t_ns).p_m, self._ahead(), sure)
+        else:
+            roomiest = max(whole, key=lambda opening: opening.places[0].clearance_m)
+            found = roomiest, roomiest.places[0]
         if found is None:
             return
-        opening, place = (found, found.places[0]) if isinstance(found, Opening) else found
+        opening, place = found
         self._chosen = opening
         self._seen_ns = percept.t_ns
         self._beyond_m.append(opening.beyond_m)
@@ -177,29 +174,6 @@ class Gap(Strategy):
         ahead, origin = self._ahead(), np.array(percept.origin_ned_m)
         known = float((self._track.at(percept.t_ns).p_m - origin) @ ahead)
         return np.asarray(origin + (p_ned_m - origin) * known / max(0.1, float((p_ned_m - origin) @ ahead)))
-
-    def _same(self, openings: list[Opening], t_ns: int, sure: bool) -> tuple[Opening, Place] | None:
-        """Return which of the openings, and which place in it, is the tracked one."""
-        at, ahead = self._track.at(t_ns).p_m, self._ahead()
-
-        def off(place: Place) -> float:
-            apart = np.array(place.p_ned_m) - at
-            along_m = float(apart @ ahead)
-            return math.hypot(float(np.linalg.norm(apart - along_m * ahead)), ALONG_SHARE * along_m if sure else 0.0)
-
-        near = [
-            (off(place), opening, place)
-            for opening in openings
-            for place in self._candidates(opening)
-        ]
-        off_m, opening, place = min(near, key=lambda row: row[0])
-        return (opening, place) if off_m < SAME_M else None
-
-    def _candidates(self, opening: Opening) -> tuple[Place, ...]:
-        """The paper's x_s where it is as good as the roomiest place, and the roomiest places."""
-        best = opening.places[0].clearance_m
-        safest = (opening.safest,) if opening.safest.clearance_m > best - 0.005 else ()
-        return (*opening.places, *safest)
 
     def _approach(self, observation: Observation) -> MissionCommand:
         """Fly to the stand-off, set on the opening, confirm that the vehicle fits; then take the run or refuse."""

@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from morpheyes_daemon.strategies.base import View
-from morpheyes_daemon.strategies.opening import Opening, Silhouette, find_openings, passage
+from morpheyes_daemon.strategies.opening import Opening, Place, Silhouette, find_openings, passage
 from morpheyes_daemon.strategies.wall import split
+from morpheyes_daemon.transforms import Array
+
+SAME_M = 0.5
+"""An opening seen this near to where the tracked one should be is the same."""
+
+ALONG_SHARE = 0.4
+"""Of what counts across, along the way: range is seen worse."""
+
+AS_GOOD_M = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,3 +60,27 @@ def gap_percept(view: View, silhouette: Silhouette) -> GapPercept:
         silhouette=silhouette,
         openings=openings,
     )
+
+
+def tracked_place(
+    openings: Sequence[Opening], at_ned_m: Array, ahead: Array, range_known: bool
+) -> tuple[Opening, Place] | None:
+    """Return which of some openings, and which place in it, is the one that should be at `at_ned_m`, None for none.
+
+    `ahead` (3,) is the way through the wall; along it nothing counts unless the range is known. The paper's x_s is a
+    place like others where it is as good as the roomiest.
+    """
+    def off(place: Place) -> float:
+        apart = np.array(place.p_ned_m) - at_ned_m
+        along_m = float(apart @ ahead)
+        across_m = float(np.linalg.norm(apart - along_m * ahead))
+        return math.hypot(across_m, ALONG_SHARE * along_m if range_known else 0.0)
+
+    near = [(off(place), opening, place) for opening in openings for place in _places(opening)]
+    off_m, opening, place = min(near, key=lambda row: row[0])
+    return (opening, place) if off_m < SAME_M else None
+
+
+def _places(opening: Opening) -> tuple[Place, ...]:
+    as_good = opening.safest.clearance_m > opening.places[0].clearance_m - AS_GOOD_M
+    return (*opening.places, opening.safest) if as_good else opening.places
