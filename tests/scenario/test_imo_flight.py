@@ -22,6 +22,7 @@ MISSION = """
 strategy: imo
 world: {world}
 avoidance: false
+still_scene: false
 parameters:
   behaviour: {{{behaviour}}}
   duration_s: {duration_s}
