@@ -46,6 +46,7 @@ class ForestWorld(Section):
 
     kind: Literal["forest"]
     course_m: float = Field(80.0, ge=10, le=500, description="from the start at (0, 0) to the goal, along x")
+    goal: bool = Field(True, description="off where a flight is over when the mission says so, wherever that is")
     trees_per_ha: float = Field(400.0, ge=0, le=1500)
     radius_min_m: float = Field(0.10, ge=0.03, le=1.0, description="of the trunk at the ground")
     radius_max_m: float = Field(0.40, ge=0.03, le=1.0)

@@ -135,14 +135,14 @@ def build_world(file: WorldFile, seed: int) -> World:
     world, light = file.world, Light() if file.light is None else file.light.light()
     match world:
         case ForestWorld():
-            planted = _world(forest_contents(world, seed, light), light, world.course_m)
+            planted = _world(forest_contents(world, seed, light), light, world.course_m if world.goal else None)
             return replace(planted, heading_rad=math.radians(world.heading_deg))
         case GapWorld():
             return _world(gap_contents(world, seed, light), light, _behind_wall_m(world))
         case RoomWorld():
             return _world(room_contents(world, LAMPS, seed), LAMPS, None, with_sky=False)
         case MixedWorld():
-            return _world(_mixed(world, seed, light), light, world.forest.course_m)
+            return _world(_mixed(world, seed, light), light, world.forest.course_m if world.forest.goal else None)
 
 
 def _behind_wall_m(world: GapWorld) -> float:

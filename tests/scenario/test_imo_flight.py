@@ -15,6 +15,7 @@ from morpheyes_daemon.messages import Track
 WORLD = """
 world:
   kind: room
+  pillars: [{pillars}]
   cube:
     waypoints: [{waypoints}]
 """
@@ -31,11 +32,11 @@ parameters:
 
 
 def flown(
-    tmp_path: Path, behaviour: str, waypoints: str, duration_s: float
+    tmp_path: Path, behaviour: str, waypoints: str, duration_s: float, pillars: str = ""
 ) -> tuple[Summary, dict[str, object], list[Track], list[np.ndarray]]:
     """Return the summary, what the judge measured, the tracks published and the vehicle's true places."""
     world = tmp_path / "hall.yaml"
-    world.write_text(WORLD.format(waypoints=waypoints), encoding="utf-8")
+    world.write_text(WORLD.format(waypoints=waypoints, pillars=pillars), encoding="utf-8")
     mission = tmp_path / "watch.yaml"
     text = MISSION.format(world=world, behaviour=behaviour, duration_s=duration_s)
     mission.write_text(text, encoding="utf-8")
@@ -79,3 +80,18 @@ def test_it_steps_out_of_the_way_of_a_cube_that_comes(tmp_path: Path) -> None:
     assert summary.outcome == "reached"
     assert summary.min_clearance_m > 0.1
     assert max(abs(place[1]) for place in places) > 0.4
+
+
+@pytest.mark.slow
+def test_it_finds_a_cube_again_that_went_behind_a_column(tmp_path: Path) -> None:
+    waypoints = "[9, 4.2, -1.2, 1.5], [12, 4.2, -0.6, 1.5], [18, 4.4, 1.7, 1.6], [21, 4.5, 1.2, 1.6]"
+    _, row, _, _ = flown(tmp_path, "kind: observe", waypoints, 13.0, pillars="[3.0, 0.5, 0.35]")
+    samples = row["samples"]
+    assert isinstance(samples, list)
+    times = [sample[0] for sample in samples]
+    hidden = int(np.argmax(np.diff(times)))
+    assert times[hidden + 1] - times[hidden] > 0.8  # it was out of sight
+    after = samples[hidden + 1 :]
+    found = [sample for sample in after if sample[2] is not None]
+    assert found[0][0] - after[0][0] <= 1.0
+    assert len(found) > 0.8 * len(after)

@@ -29,7 +29,7 @@ def test_the_documented_strategy_flies(tmp_path: Path, monkeypatch: pytest.Monke
     point = EntryPoint("ahead", "documented_ahead:Ahead", "morpheyes.strategies")
     monkeypatch.setattr(registry, "entry_points", lambda group: [point])
     (tmp_path / "ahead.yaml").write_text(block("yaml"), encoding="utf-8")
-    world = {"kind": "forest", "course_m": 10, "half_width_m": 12, "run_in_m": 6, "trees_per_ha": 900}
+    world = {"kind": "forest", "course_m": 10, "half_width_m": 12, "run_in_m": 6, "trees_per_ha": 900, "goal": False}
     (tmp_path / "grove.yaml").write_text(yaml.safe_dump({"world": world}), encoding="utf-8")
     plan = make_plan(
         str(tmp_path / "ahead.yaml"),
@@ -40,7 +40,7 @@ def test_the_documented_strategy_flies(tmp_path: Path, monkeypatch: pytest.Monke
     )
     commands: list[MissionCommand] = []
     summary = fly(plan, Watchers(attach=[lambda daemon, stage: daemon.topics.command.tap(commands.append)]))
-    assert summary.outcome != "collided"
+    assert summary.outcome == "reached"
     assert max(command.v_ned_m_s[0] for command in commands) == pytest.approx(1.5, abs=0.05)
     assert commands[-1].z_close_m < 16.0
 

@@ -46,13 +46,13 @@ LARGEST_M, SMALLEST_M = 1.5, 0.04
 RADIUS_GAIN = 0.15
 
 LIKELY, SURELY = 2.0, 4.0
-"""Sigmas off its former place from which an object goes on moving, and from which one on trial is known to move."""
+"""Sigmas off its former place from which an object goes on moving; the second when its corners seem to stand."""
 
 FEWEST_STANDING, STANDING_SHARE = 4, 0.7
 """So many corners, and this share of them, make an object one that seems to stand."""
 
 JOINED = 0.5
-"""An object whose surroundings are as far away for more than this share is a piece of something larger."""
+"""An object whose surroundings are as far away on both sides for more than this share is a piece of something."""
 
 UNSURE_SHARE = 0.03
 """Of the baseline: with a larger sigma of it nothing is concluded."""
@@ -159,15 +159,15 @@ class Finder:
     def _evidence(self, candidate: _Candidate, frame: Frame, clustered: int) -> int:
         """Return how clearly a candidate moves in this frame, in frames: 0 to 2.
 
-        On trial nothing counts while its corners stand: the middle of a column's pixels wanders along it.
+        On trial only corners that move count, and nothing while the others stand: the middle of a trunk's pixels
+        wanders along it.
         """
         if not _is_apart(candidate):
             return 0
         stands = self._stands(candidate)
-        if stands and not candidate.confirmed:
-            return 0
-        sigmas = LIKELY if candidate.confirmed and not stands else SURELY
-        return clustered or int(self._has_moved(candidate, frame, sigmas))
+        if not candidate.confirmed:
+            return 0 if stands else clustered
+        return clustered or int(self._has_moved(candidate, frame, SURELY if stands else LIKELY))
 
     def _stands(self, candidate: _Candidate) -> bool:
         """Tell whether the corners on the object agree with a scene that stands."""
@@ -264,8 +264,7 @@ def _is_apart(candidate: _Candidate) -> bool:
 
 def _grown(radius_m: float, cluster: Cluster) -> float:
     """Return the radius after a cluster that reaches further: what moves together belongs together."""
-    reach_m = min(cluster.radius_m, LARGEST_M)
-    return radius_m + 0.5 * max(0.0, reach_m - radius_m)
+    return max(radius_m, min(cluster.radius_m, LARGEST_M))
 
 
 def _in_ned(frame: Frame, covariance: Array) -> Array:

@@ -39,6 +39,9 @@ STEPS = 6
 RING = (1.35, 1.75)
 """Radii of the ring around an object that should show something else, as multiples of its own."""
 
+SECTORS = 8
+"""Into which the ring is cut: does the object go on in any direction?"""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
@@ -54,8 +57,8 @@ class Expected:
 class Sighting:
     """What one frame says of the object: mask (H, W), middle pixel (2,), depth of the visible face and its point (3,).
 
-    `alike` is the correlation of the patch between the eyes, `whole` whether it lies inside the image, `joined` the
-    share of the ring around it that is as far away: a thing by itself has little of that, a piece of wall much.
+    `alike` is the correlation of the patch between the eyes, `whole` whether it lies inside the image, `joined` how
+    much the surroundings on both sides are as far away: a thing by itself has little of that, a piece of wall much.
     """
 
     mask: Mask
@@ -213,10 +216,22 @@ def _sighting(
 
 
 def _joined(frame: Frame, patch: _Patch, middle: Array, depth_m: float, radius_m: float) -> float:
-    """Return the share of the ring around the object whose depth is the object's, within its radius."""
+    """Return how much the object goes on, at its own depth, on both sides of itself: 0 a thing by itself, 1 a piece.
+
+    The ring around it is cut into sectors; of two that face each other the lesser share that is as far away as the
+    object counts (what lies outside the window is left out), and of all such pairs the greatest. A trunk goes on in
+    one direction alone, a wall in all, what stands on the ground only downwards.
+    """
     ring = _disc(frame, patch, middle, depth_m, RING[1] * radius_m)
     ring &= ~_disc(frame, patch, middle, depth_m, RING[0] * radius_m)
+    if not ring.any():
+        return 1.0
+    rows, columns = np.nonzero(ring)
+    angle = np.arctan2(rows + patch.top - middle[1], columns + patch.left - middle[0])
+    sector = np.rint(angle / (2.0 * np.pi / SECTORS)).astype(np.intp) % SECTORS
     step_m = MATCH_PX * depth_m * depth_m / frame.bf_m_px
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore"):
         same = np.abs(patch.depth_m[ring] - depth_m) < radius_m + step_m
-    return float(same.mean()) if same.size else 1.0
+        share = np.bincount(sector, same, SECTORS) / np.bincount(sector, minlength=SECTORS)
+    lesser = np.fmin(share[: SECTORS // 2], share[SECTORS // 2 :])
+    return float(np.nanmax(lesser))
