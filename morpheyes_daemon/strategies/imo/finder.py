@@ -45,8 +45,14 @@ LARGEST_M, SMALLEST_M = 1.5, 0.04
 
 RADIUS_GAIN = 0.15
 
+ENLARGED, ENLARGED_TO_M = 1.3, 0.3
+"""What goes on beyond its radius may be larger than the few corners that gave it away: by so much a frame, so far."""
+
 LIKELY, SURELY = 2.0, 4.0
-"""Sigmas off its former place from which an object goes on moving; the second when its corners seem to stand."""
+"""Sigmas off its former place from which an object goes on moving; the second on trial or when its corners stand."""
+
+CORNER_FRAMES = 2
+"""Frames in which corners must have moved before the object's middle may tell of motion."""
 
 FEWEST_STANDING, STANDING_SHARE = 4, 0.7
 """So many corners, and this share of them, make an object one that seems to stand."""
@@ -70,6 +76,7 @@ class _Candidate:
     radius_m: float
     born_ns: int
     moved: deque[int] = field(default_factory=lambda: deque(maxlen=OF))
+    corner_frames: int = 0
     confirmed: bool = False
     seen_ns: int = 0
     moved_ns: int = 0
@@ -131,7 +138,9 @@ class Finder:
             if candidate.filter.surprise(p_ned, covariance) < GATE:
                 candidate.filter.update(p_ned, covariance)
                 candidate.sighting, candidate.seen_ns = sighting, frame.t_ns
-                if sighting.whole:
+                if sighting.joined >= JOINED and not candidate.confirmed:
+                    candidate.radius_m = max(candidate.radius_m, min(ENLARGED * candidate.radius_m, ENLARGED_TO_M))
+                elif sighting.whole:
                     fresh = min(max(sighting.radius_m, SMALLEST_M), LARGEST_M)
                     candidate.radius_m += RADIUS_GAIN * (fresh - candidate.radius_m)
 
@@ -159,15 +168,16 @@ class Finder:
     def _evidence(self, candidate: _Candidate, frame: Frame, clustered: int) -> int:
         """Return how clearly a candidate moves in this frame, in frames: 0 to 2.
 
-        On trial only corners that move count, and nothing while the others stand: the middle of a trunk's pixels
-        wanders along it.
+        On trial nothing counts while its corners stand, nor the way of its middle before corners have moved in some
+        frames: the middle of a trunk's pixels wanders along it.
         """
         if not _is_apart(candidate):
             return 0
-        stands = self._stands(candidate)
-        if not candidate.confirmed:
+        stands, on_trial = self._stands(candidate), not candidate.confirmed
+        candidate.corner_frames += clustered > 0 and not stands
+        if on_trial and (stands or candidate.corner_frames < CORNER_FRAMES):
             return 0 if stands else clustered
-        return clustered or int(self._has_moved(candidate, frame, SURELY if stands else LIKELY))
+        return clustered or int(self._has_moved(candidate, frame, SURELY if stands or on_trial else LIKELY))
 
     def _stands(self, candidate: _Candidate) -> bool:
         """Tell whether the corners on the object agree with a scene that stands."""
