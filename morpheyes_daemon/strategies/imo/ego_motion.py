@@ -75,7 +75,8 @@ def refine(told: Array, dt_s: float, p_before: Array, uvd_now: Array, now: Frame
 
     Iterated least squares with a Geman-McClure kernel that narrows from step to step, and the told motion as prior.
     """
-    scene = _Scene(p_before, uvd_now, now, np.linalg.inv(prior_covariance(dt_s)))
+    told_information = np.asarray(np.linalg.inv(prior_covariance(dt_s)), dtype=np.float64)
+    scene = _Scene(p_before, uvd_now, now, told_information)
     fit = _Fit(told.copy(), np.zeros(6), scene.information)
     share = _area_share(p_before[:, 2])
     for width in WIDTHS:
