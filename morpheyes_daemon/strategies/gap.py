@@ -24,7 +24,7 @@ from morpheyes_daemon.strategies.gap_crossing import Crossing
 from morpheyes_daemon.strategies.gap_parameters import GapParameters
 from morpheyes_daemon.strategies.gap_percept import GapPercept, gap_percept, tracked_place
 from morpheyes_daemon.strategies.gap_track import Motion, PointTrack
-from morpheyes_daemon.strategies.opening import Opening, Silhouette
+from morpheyes_daemon.strategies.opening import Opening, Place, Silhouette
 from morpheyes_daemon.transforms import Array, wrap_rad
 
 
@@ -156,7 +156,8 @@ class Gap(Strategy):
         p = self._scaled(np.array(place.p_ned_m), percept)
         _, nods, turns = observation.at_exposure.rates_frd_rad_s
         sigma = np.hypot(RANGE_SIGMA, ATTITUDE_LATE_S * np.array([0.0, turns, nods]))
-        self._track.see(percept.t_ns, p, sigma * max(0.5, opening.z_m), opening.z_m)
+        sigma_m = np.hypot(sigma * max(0.5, opening.z_m), self._room_missed_m(place))
+        self._track.see(percept.t_ns, p, sigma_m, opening.z_m)
         if self._phase is not Phase.RUN:
             heading = np.array([0.0, wrap_rad(percept.yaw_rad - self._yaw_rad), 0.0])
             self._yaw.see(percept.t_ns, heading, YAW_SIGMA)
@@ -166,6 +167,10 @@ class Gap(Strategy):
         if self._phase in (Phase.APPROACH, Phase.CLOSE) and self._track.spread_m(3.0) > MOVES_M:
             self._track.move()
             self._yaw.move()
+
+    def _room_missed_m(self, place: Place) -> float:
+        """How much less room is seen than was measured: so much of the opening may be missing on one side."""
+        return max(0.0, float(np.median(self._room)) - place.clearance_m) if self._phase is Phase.RUN else 0.0
 
     def _scaled(self, p_ned_m: Array, percept: GapPercept) -> Array:
         """Return where the opening was seen; with the eyes under way only the direction, at the range known before."""
