@@ -146,9 +146,9 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         "servo-ran-in",
-        "so they did before the pilot engaged",
+        "so they did before the pilot engaged: depth is wrong, which tells at speed only",
         SCALE_S + 2.0,
-        _row(*[None] * 3, E.HOLDS),
+        _row(*[None] * 3, E.HOLDS_IF_IT_MATTERS),
         acts.servo(ServoFault.RUNS_IN),
         acts.engage,
         5.0,
