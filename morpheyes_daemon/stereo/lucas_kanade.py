@@ -21,11 +21,12 @@ def follow(
     window_px: int,
     levels: int,
     least_texture: float = 1e-4,
+    rounds: int = 30,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return where points (n, 2) of the first grey image are in the second, beginning at `guess`, and which were found.
 
     `levels` halvings of the images beside themselves; `least_texture` is the smallest eigenvalue of a window's
-    gradients, per pixel, below which a point is not found.
+    gradients, per pixel, below which a point is not found; `rounds` of improvement on each level at most.
     """
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         first,
@@ -34,6 +35,7 @@ def follow(
         np.array(guess, dtype=np.float32).reshape(-1, 1, 2),
         winSize=(window_px, window_px),
         maxLevel=levels,
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, rounds, 0.01),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=least_texture,
     )

@@ -5,11 +5,14 @@ Pyramidal Lucas-Kanade of OpenCV, started from where geometry expects the corner
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages import Image
+from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.strategies.imo.frames import Frame
 from morpheyes_daemon.transforms import Array
 
@@ -28,7 +31,7 @@ QUALITY = 0.01
 BLOCK_PX, FITS, NEAREST_M = 11, 0.85, 1.5
 """Of the search along the row: the block, the correlation that counts, and how near it looks."""
 
-_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+ROUNDS = 20
 
 
 def corners(image: Image, count: int, spacing_px: float, free: NDArray[np.uint8] | None = None) -> Array:
@@ -44,8 +47,9 @@ def followed(before: Image, now: Image, uv: Array, guess: Array) -> tuple[Array,
     if not len(uv):
         return np.empty((0, 2)), np.zeros(0, dtype=np.bool_)
     start = np.where(np.isfinite(guess), guess, uv)
-    there, ok = _step(before, now, uv, start)
-    back, ok_back = _step(now, before, there, uv)
+    step = partial(follow, window_px=WINDOW_PX, levels=LEVELS, least_texture=1e-3, rounds=ROUNDS)
+    there, ok = step(before, now, uv, start)
+    back, ok_back = step(now, before, there, uv)
     good = ok & ok_back & (np.linalg.norm(back - uv, axis=1) < BACK_PX)
     return there, good
 
@@ -90,12 +94,3 @@ def disparity_along_row(frame: Frame, uv: Array) -> Array:
             found[k] = u - half - first - best
     return found
 
-
-def _step(a: Image, b: Image, uv: Array, guess: Array) -> tuple[Array, Mask]:
-    points = np.ascontiguousarray(uv, dtype=np.float32).reshape(-1, 1, 2)
-    start = np.ascontiguousarray(guess, dtype=np.float32).reshape(-1, 1, 2).copy()
-    there, ok, _ = cv2.calcOpticalFlowPyrLK(
-        a, b, points, start, winSize=(WINDOW_PX, WINDOW_PX), maxLevel=LEVELS, criteria=_STOP,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-3,
-    )  # fmt: skip
-    return np.asarray(there, dtype=np.float64).reshape(-1, 2), np.asarray(ok, dtype=np.bool_).ravel()
