@@ -110,7 +110,7 @@ def _page(summary: Summary, folder: Path) -> str:
         ("outcome", f"{s.outcome} ({s.reason})"),
         ("time, path", f"{s.time_s:.1f} s, {s.path_m:.1f} m"),
         ("speed", f"{s.mean_speed_m_s:.2f} m/s mean, {s.peak_speed_m_s:.2f} m/s peak"),
-        ("smallest clearance", f"{s.min_clearance_m:.2f} m (hull and bar to obstacle)"),
+        ("smallest clearance", f"{1e3 * s.min_clearance_m:.0f} mm (hull and bar to obstacle)"),
         ("baseline", f"{s.baseline_mode}, {s.baseline_min_m * 1e3:.0f} to {s.baseline_max_m * 1e3:.0f} mm"),
         ("calibration", s.calibration),
         ("vision", f"{s.frames} frames of {s.image_size} at {s.perception_rate_hz:.1f} Hz"),

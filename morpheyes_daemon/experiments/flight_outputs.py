@@ -82,7 +82,7 @@ class FlightOutputs:
         self._film.close()
         title = f"{summary.mission}, seed {summary.seed}, baseline {summary.baseline_mode}: {summary.outcome}"
         speed, room = summary.mean_speed_m_s, summary.min_clearance_m
-        figures = f"{summary.time_s:.1f} s, {speed:.2f} m/s, clearance {room:.2f} m"
+        figures = f"{summary.time_s:.1f} s, {speed:.2f} m/s, clearance {1e3 * room:.0f} mm"
         draw_map(
             self._folder / "map.png",
             self._series,
