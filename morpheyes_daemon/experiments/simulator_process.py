@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import signal
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
@@ -38,6 +39,9 @@ from morpheyes_daemon.simulation.vehicle import Truth
 
 EXPOSURE_LAG_NS = 10 * MS
 """A pose is asked for this long after its moment, so that it lies between two that are known."""
+
+NICENESS = 10
+"""A vehicle does not render its own pictures: they give way to the daemon, as its vision worker does."""
 
 ALT_HOLD_POSITION = 4
 """FLTMODE4 of the recommended parameters."""
@@ -116,6 +120,7 @@ class Heard:
 def simulate(job: SimulatorJob, pipe: Connection) -> None:
     """The process's whole life."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group; the parent decides
+    os.nice(NICENESS)
     try:
         asyncio.run(_simulate(job, pipe))
     except MorphEyesError as error:

@@ -56,7 +56,7 @@ class ProcessWorker(Generic[Job, Result]):
         *,
         job_timeout_s: float,
         start_timeout_s: float = 60.0,
-        niceness: int = 5,
+        niceness: int = 10,
         on_idle_death: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._factory, self._niceness = factory, niceness
