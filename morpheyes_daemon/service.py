@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import gc
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -45,9 +44,6 @@ STICKS_SILENT_S = 1.0
 CAMERA_ALIVE_S = 2.0
 VISION_SILENT_S = 30.0
 """Longer than it takes to kill a hung vision worker and to start another; killing the daemon for it mends nothing."""
-
-GIVE_WAY_S = 0.0005
-"""Python's own 5 ms would make stick messages late by as much."""
 
 Say = Callable[[str], None]
 
@@ -112,19 +108,14 @@ async def serve(config: VehicleConfig, mission_name: str, mission: MissionFile, 
 
 
 def real_time_runner() -> asyncio.Runner:
-    """Return what runs the daemon: uvloop's event loop where it is installed, else asyncio's own.
+    """Return what runs the daemon: asyncio's own loop, since uvloop's timers know whole milliseconds only.
 
     What is imported by now stays: the garbage collector need not look at it again, which takes longer than a stick
-    period. Threads, such as the recorder's, give way to the loop within `GIVE_WAY_S`.
+    period.
     """
-    sys.setswitchinterval(GIVE_WAY_S)
     gc.collect()
     gc.freeze()
-    try:
-        import uvloop
-    except ModuleNotFoundError:
-        return asyncio.Runner()
-    return asyncio.Runner(loop_factory=uvloop.new_event_loop)
+    return asyncio.Runner()
 
 
 def event_line(event: Event, began_ns: int) -> str:

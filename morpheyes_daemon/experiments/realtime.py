@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import json
 import multiprocessing
-import os
 import tempfile
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, closing
@@ -63,7 +62,6 @@ class Simulator:
         self.verdict: asyncio.Future[Verdict] = loop.create_future()
         self._said: tuple[Any, Any] | None = None
         loop.add_reader(pipe.fileno(), self._read)
-        os.set_blocking(pipe.fileno(), True)  # uvloop made it non-blocking: half a message would look like the end
 
     async def get_ready(self) -> Ready:
         """Wait until everything is served; raises what kept it from that."""
