@@ -33,6 +33,9 @@ PER_FLIGHT = 200
 BETWEEN_S = (0.0, 0.2)
 WATCHED_S = 1.1
 """A release is repeated for a second."""
+AUTOPILOT = (1, mavlink.MAV_COMP_ID_AUTOPILOT1)
+"""System and component; a ground station's heartbeats pass by as well."""
+
 LIMIT_S = 0.05
 """From the arrival of the pilot's message to the release."""
 
@@ -153,7 +156,9 @@ async def _take_over(flight: FaultFlight, way: str) -> dict[str, Any]:
 
 
 def tells_of_the_pilot(data: bytes, channel: int) -> bool:
-    """Tell whether a MAVLink 2 frame of the autopilot says that the switch is off, or the mode another."""
+    """Tell whether a MAVLink 2 frame comes from the autopilot and says that the switch is off, or the mode another."""
+    if tuple(data[5:7]) != AUTOPILOT:
+        return False
     number = int.from_bytes(data[7:10], "little")
     if number == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
         return int.from_bytes(data[10:14], "little") != LOITER
