@@ -107,6 +107,9 @@ class Stage:
         """Where the vehicle really was."""
         return self.vehicle.truth_at(t_ns)
 
+    async def catch_up(self) -> None:
+        """Bring the vehicle up to the present, should the loop have been held up; in lockstep it never is."""
+
     def world_s(self, t_ns: int) -> float:
         """Time of the world, by which things in it move."""
         return (t_ns - self._epoch_ns) / S

@@ -14,7 +14,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.clock import Clock, S
+from morpheyes_daemon.clock import MS, Clock, S
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
 from morpheyes_daemon.simulation.autopilot_port import ByteLink
 from morpheyes_daemon.simulation.radio import Radio
@@ -25,6 +25,8 @@ RATE_HZ = 100.0
 KEPT = 400
 AHEAD_NS = S // 2
 """A simulator that is this far behind is extrapolated; beyond it nothing is known."""
+LATE_NS, PATIENCE_NS = 50 * MS, 3 * S
+"""One that is so late is waited for, so long."""
 IDENTITY = (254, 190)
 """System and component id of this listener: no ground station that anybody waits for."""
 METRES_PER_DEGREE = 6_378_137.0 * math.pi / 180.0
@@ -63,12 +65,20 @@ class SitlVehicle:
             self._ask()
             await self._clock.sleep_until_ns(self._clock.now_ns() + S // 2)
 
+    async def catch_up(self) -> None:
+        """Wait until the truth is as good as the present; DeviceTimeoutError when the SITL says nothing any more."""
+        began_ns = self._clock.now_ns()
+        while (now_ns := self._clock.now_ns()) - self._rows[-1].t_ns > LATE_NS:
+            if now_ns - began_ns > PATIENCE_NS:
+                raise DeviceTimeoutError("the SITL has stopped sending SIM_STATE; is it still running?")
+            await self._clock.sleep_until_ns(now_ns + MS)
+
     def truth_at(self, t_ns: int) -> Truth:
         """Return the truth at `t_ns`; InputError for a time that is no longer, or not yet, known."""
         rows = tuple(self._rows)
         index = bisect_right(rows, t_ns, key=lambda row: row.t_ns)
         if index == 0 or t_ns > rows[-1].t_ns + AHEAD_NS:
-            raise InputError(f"the SITL's pose at {t_ns} ns is not known; it may have stopped.")
+            raise InputError(f"the SITL's pose at {t_ns} ns is not known.")
         truth = _moved(rows[-1], t_ns) if index == len(rows) else _between(rows[index - 1], rows[index], t_ns)
         north, east, down = truth.p_ned_m
         return replace(truth, p_ned_m=(north + self._start[0], east + self._start[1], down))

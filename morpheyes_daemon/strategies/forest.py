@@ -63,6 +63,9 @@ ASTRAY_RAD = math.radians(75.0)
 RESPONSE_S = 0.7
 """Time constant with which Loiter takes up a velocity."""
 
+MOST_TURN_RAD = 0.9
+"""A command turns the course by no more."""
+
 FIRST_DETOUR_M = 4.0
 """Flown away from the goal before turning back for the first time."""
 
@@ -142,7 +145,7 @@ class Forest(Strategy):
             right = self._around.side < 0 if around else _right_is_freer(profile)
             self._start_looking(1.0 if right else -1.0, math.inf)
             return self._look(observation, profile.near_limit_m, dt_s)
-        return self._fly(choice, obstacles, observation, dt_s, distance_m)
+        return self._fly(choice, obstacles, observation, dt_s, to_goal)
 
     def _settle(self, vehicle: VehicleState) -> None:
         """Before the mission engages: goal and height follow the vehicle, and what the climb showed is forgotten."""
@@ -196,16 +199,18 @@ class Forest(Strategy):
                 break
         else:
             return None
+        clipped_goal = _clip(goal_rad, headings)
+        z_goal = float(free_distance_m(obstacles, np.array([clipped_goal]), half_width, reach)[0])
+        if z_goal >= distance_m and clipped_goal == goal_rad:
+            self._around.end(observation.now_ns)
         if self._around.side:
             best = self._around.heading(headings, free)
             return float(headings[best]), half_width, float(free[best])
-        clipped_goal = _clip(goal_rad, headings)
         capped = np.minimum(free, max(distance_m, 1.0))
         off_goal = np.abs(_wrapped(headings - goal_rad))
         off_course = np.abs(_wrapped(headings - self._heading_rad))
         progress = capped * np.cos(np.minimum(off_goal, math.pi / 2) * 0.8) - 0.8 * off_course - 0.5 * off_goal
         free_rad = float(headings[int(np.argmax(np.where(free >= parameters.safe_m, progress, -np.inf)))])
-        z_goal = float(free_distance_m(obstacles, np.array([clipped_goal]), half_width, reach)[0])
         weight = self._weight(z_goal, observation.reserve_m) if z_goal < min(reach, distance_m) else 0.0
         heading = clipped_goal + weight * wrap_rad(free_rad - clipped_goal)
         z_close = float(free_distance_m(obstacles, np.array([heading]), half_width, reach)[0])
@@ -228,7 +233,7 @@ class Forest(Strategy):
         obstacles: Floats,
         observation: Observation,
         dt_s: float,
-        distance_m: float,
+        to_goal: tuple[float, float],
     ) -> MissionCommand:
         heading, half_width, z_close = choice
         vehicle = observation.vehicle
@@ -236,13 +241,13 @@ class Forest(Strategy):
         vx, vy, _ = vehicle.v_ned_m_s
         speed = math.hypot(vx, vy)
         course = math.atan2(vy, vx) if speed > 0.5 else heading
-        turn = self._turn.step(wrap_rad(heading - course), dt_s, low=-0.9, high=0.9)
+        turn = self._turn.step(wrap_rad(heading - course), dt_s, low=-MOST_TURN_RAD, high=MOST_TURN_RAD)
         command_rad = course + turn if speed > 0.5 else heading
         slim = self._half_width_m(self.parameters.tight_margin_m * 0.5, observation.baseline_m)
         reach = self.parameters.reach_m
         drift = float(free_distance_m(obstacles, np.array([course]), slim, reach)[0]) if speed > 0.5 else reach
         clear = min(z_close, drift)
-        wanted = min(self.parameters.speed_m_s, 0.3 + 0.8 * distance_m)
+        wanted = min(self.parameters.speed_m_s, 0.3 + 0.8 * math.hypot(*to_goal), self._homing_m_s(to_goal, course))
         facing = math.cos(min(math.pi / 2, 1.5 * abs(wrap_rad(heading - vehicle.yaw_rad))))
         wanted *= max(0.15, facing)
         way = np.array([math.cos(command_rad), math.sin(command_rad)])
@@ -259,6 +264,12 @@ class Forest(Strategy):
             z_close,
             {"heading_rad": heading, "drift_m": drift, "half_width_m": half_width},
         )
+
+    def _homing_m_s(self, to_goal: tuple[float, float], course_rad: float) -> float:
+        """Return the speed at which the turn onto the goal is narrow enough not to circle around it."""
+        rate_rad_s = MOST_TURN_RAD / (2.0 * self.craft.frame_period_s + RESPONSE_S)
+        off_rad = min(math.pi / 2, abs(wrap_rad(math.atan2(to_goal[1], to_goal[0]) - course_rad)))
+        return rate_rad_s * math.hypot(*to_goal) / (2.0 * max(0.01, math.sin(off_rad)))
 
     def _turnable(self, obstacles: Floats, v_m_s: Floats, wanted_m_s: Floats, half_width_m: float) -> float:
         """Return which share of the wanted velocity keeps clear on the way to the next decision.

@@ -44,6 +44,10 @@ class WayAround:
             self.side = 1 if off_goal_rad > 0.0 else -1
         return self.side != 0
 
+    def end(self, now_ns: int) -> None:
+        """Note that nothing is in the way."""
+        self.side, self._nearer_ns = 0, now_ns
+
     def heading(self, headings_rad: Floats, free_m: Floats) -> int:
         """Return which of the headings (M,), left to right, keeps closest to what is in the way."""
         wide = np.flatnonzero(free_m >= min(WIDE_M, 0.6 * float(free_m.max())))

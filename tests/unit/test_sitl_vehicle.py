@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.errors import DeviceTimeoutError, InputError
 from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.sitl_vehicle import AHEAD_NS, SitlVehicle
 from tests.hand_clock import HandClock
@@ -23,9 +24,21 @@ class Deaf:
         """Nobody reads what is asked for."""
 
 
-class Bench:
+class PassingClock(HandClock):
+    """Sleeping moves the time; `meanwhile` happens on the first sleep."""
+
     def __init__(self) -> None:
-        self.clock = HandClock()
+        super().__init__()
+        self.meanwhile: Callable[[], object] = lambda: None
+
+    async def sleep_until_ns(self, t_ns: int) -> None:
+        self.t_ns = t_ns
+        self.meanwhile()
+
+
+class Bench:
+    def __init__(self, clock: PassingClock | None = None) -> None:
+        self.clock = clock or PassingClock()
         self.vehicle = SitlVehicle(Deaf(), Radio(), self.clock)
         self.sender = mavlink.MAVLink(None, 1, 1)
 
@@ -71,3 +84,20 @@ def test_it_moves_on_for_a_while_and_then_says_that_it_does_not_know() -> None:
         bench.vehicle.truth_at(t_ns + AHEAD_NS + 1)
     with pytest.raises(InputError, match="not known"):
         bench.vehicle.truth_at(t_ns - 1)
+
+
+async def test_a_pose_that_comes_late_is_waited_for() -> None:
+    bench = Bench(PassingClock())
+    bench.say(0.0, 0.0, 0.0)
+    bench.clock.t_ns += 2 * S
+    bench.clock.meanwhile = lambda: bench.say(1.0, 0.0, 0.0)
+    await bench.vehicle.catch_up()
+    assert bench.vehicle.truth_at(bench.clock.now_ns()).p_ned_m[0] == pytest.approx(1.0, abs=0.012)
+
+
+async def test_a_sitl_that_has_stopped_is_not_waited_for_in_vain() -> None:
+    bench = Bench(PassingClock())
+    bench.say(0.0, 0.0, 0.0)
+    bench.clock.t_ns += S
+    with pytest.raises(DeviceTimeoutError, match="stopped"):
+        await bench.vehicle.catch_up()
