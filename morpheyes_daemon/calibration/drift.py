@@ -55,8 +55,6 @@ class DriftLimits:
     """Time offset between the eyes that was declared."""
     late_change_s: float = 1e-3
     """How far the measured offset may be from it."""
-    baseline_share: float = KNOWN_SHARE
-    """A frame whose baseline is not known to this share tells nothing."""
     yaw_pairs: int = 2
     """Pairs of frames, each of other seconds, that must agree before a yaw is called too large to be a drift."""
     steady_s: float = 0.5
@@ -156,7 +154,7 @@ class DriftMonitor:
 
     def knows(self, depth: DepthMap) -> bool:
         """Return whether the baseline of a frame is known well enough for its rows to mean anything."""
-        return depth.baseline_sigma_m < self.limits.baseline_share * depth.baseline_m
+        return depth.baseline_sigma_m < KNOWN_SHARE * depth.baseline_m
 
     def doubt_rad(self, baseline: BaselineEstimate) -> float:
         """Return by what angle rows may be apart since the baseline may be two sigmas off."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from morpheyes_daemon.calibration.ego_motion import EyeMotion
 from morpheyes_daemon.messages import DepthMap, Image, Pinhole
-from morpheyes_daemon.stereo.lucas_kanade import follow_and_return
+from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.transforms import Array, R_from_rotvec
 
 _POINTS, _SPACING_PX, _WINDOW_PX = 160, 8, 15
@@ -90,7 +90,7 @@ def scale_between(first: Sight, second: Sight) -> ScaleFit | None:
     places = _rays(uv, first.depth.pinhole) * first.depth.depth_m[uv[:, 1], uv[:, 0]].astype(np.float64)[:, None]
     R_2_1 = second.motion.T_ned_rect[:3, :3].T @ first.motion.T_ned_rect[:3, :3]
     turned = places @ R_2_1.T
-    seen, good = follow_and_return(
+    seen, good = follow(
         first.left,
         second.left,
         uv,

@@ -18,8 +18,6 @@ from morpheyes_daemon.safety.states import State
 RATE_HZ = 50.0
 GOAL_TOLERANCE_M = 4.0
 """Goal radius plus the autopilot's own drift over a flight."""
-SKIDS_M = 0.06
-"""Half the height of the hull: nearer to the ground the vehicle touches it."""
 GIVEN_UP_S = 4.0
 """A flight that has been in HOLD for so long will not go on by itself."""
 
@@ -117,7 +115,7 @@ class Judge:
             v = self._stage.truth(now_ns).v_ned_m_s
             depth, speed = -self._clearance_m * 1e3, math.hypot(*v)
             return Outcome.COLLIDED, f"hull or bar {depth:.0f} mm into an obstacle at {speed:.1f} m/s, {state}"
-        if self._height_m <= SKIDS_M and state is State.ENGAGED:
+        if self._height_m <= self._stage.skids_m and state is State.ENGAGED:
             return Outcome.COLLIDED, "the ground touched in flight"
         if self._engaged_ns and now_ns - self._engaged_ns > self._limit_s * S:
             return Outcome.TIMEOUT, f"not there after {self._limit_s:.0f} s"

@@ -98,6 +98,7 @@ class Stage:
             Renderer(self.world.scene), self.rig, config.camera.mount, sensor, seed, self._epoch_ns, render_threads
         )
         self._shape = VehicleShape(config.footprint, config.camera.mount)
+        self.skids_m = config.footprint.hull_height_mm / 2e3
 
     def baseline_m(self, t_ns: int) -> float:
         """True distance between the eyes."""

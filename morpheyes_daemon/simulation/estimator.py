@@ -215,21 +215,14 @@ class Estimator:
 
     def _range_m(self, truth: Truth) -> float:
         tilt = math.cos(truth.roll_rad) * math.cos(truth.pitch_rad)
-        north, east = _beam_ne(truth)
-        distance = self._vehicle.ground.range_m(truth.p_ned_m, (north, east, max(0.3, tilt)))
+        north, east, _ = truth.T_ned_frd[:3, 2]
+        distance = self._vehicle.ground.range_m(truth.p_ned_m, (float(north), float(east), max(0.3, tilt)))
         distance += self.noise.height_m * self._random.gauss()
         return min(max(distance, self._table["RNGFND1_MIN"]), self._table["RNGFND1_MAX"])
 
 
 def _wrapped(angle_rad: float) -> float:
     return math.atan2(math.sin(angle_rad), math.cos(angle_rad))
-
-
-def _beam_ne(truth: Truth) -> tuple[float, float]:
-    """Return where the body's down axis points to, north and east parts."""
-    forward, right = math.sin(truth.pitch_rad) * math.cos(truth.roll_rad), -math.sin(truth.roll_rad)
-    cos, sin = math.cos(truth.yaw_rad), math.sin(truth.yaw_rad)
-    return forward * cos - right * sin, forward * sin + right * cos
 
 
 def _body_rates(before: Truth, now: Truth) -> tuple[float, float, float]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages import FloatMap, Image, Pinhole
-from morpheyes_daemon.stereo.lucas_kanade import follow_and_return
+from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.transforms import Array
 
 CELLS = (24, 18)
@@ -107,7 +107,7 @@ def row_offsets(left: Image, right: Image, disparity_px: FloatMap) -> RowOffsets
     if not len(start):
         return RowOffsets(np.empty((0, 2)), np.empty(0), np.empty(0))
     expected = start - np.stack([d, np.zeros_like(d)], axis=1)
-    found, good = follow_and_return(
+    found, good = follow(
         left,
         right,
         start,

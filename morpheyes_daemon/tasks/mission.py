@@ -60,10 +60,10 @@ async def mission(
 
     It thinks for milliseconds, and begins when a stick message has just gone out: that long the next can wait.
     """
-    percepts, beats = topics.perception.reader(), topics.gate.reader()
+    percepts = topics.perception.reader()
     while True:
         await percepts.next()
-        await beats.next()
+        await topics.gate.reader().next()
         seen = percepts.newest()
         observation = observe(seen, track, vehicle, guardian, clock.now_ns(), reaction_s)
         topics.observation.publish(observation)

@@ -1,22 +1,44 @@
-"""The forest mission slows down where the way to a new heading bends through something before the next frame."""
+"""The forest mission slows down where the way to a new heading bends through something, and to turn onto its goal."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 
 from morpheyes_daemon.config import Footprint
 from morpheyes_daemon.strategies.base import Craft
-from morpheyes_daemon.strategies.forest import Forest, ForestParameters, Goal
+from morpheyes_daemon.strategies.forest import MOST_TURN_RAD, RESPONSE_S, Forest, ForestParameters, Goal
+from morpheyes_daemon.transforms import wrap_rad
 
 TREE = np.array([[1.65, 1.5]])
 """Off the straight ways along x and along y, on the bend between them."""
 AHEAD, ASIDE = np.array([3.0, 0.0]), np.array([0.0, 3.0])
 
 
-def share(frame_period_s: float, obstacles: np.ndarray, before: np.ndarray, wanted: np.ndarray) -> float:
+def forest(frame_period_s: float) -> Forest:
     craft = Craft(Footprint(), np.eye(4), (0.1, 0.3), frame_period_s, 3.0, 0.2)
-    return Forest(ForestParameters(goal=Goal()), craft)._turnable(obstacles, before, wanted, 0.4)
+    return Forest(ForestParameters(goal=Goal()), craft)
+
+
+def share(frame_period_s: float, obstacles: np.ndarray, before: np.ndarray, wanted: np.ndarray) -> float:
+    return forest(frame_period_s)._turnable(obstacles, before, wanted, 0.4)
+
+
+def nearest_m(frame_period_s: float, course_rad: float, speed_m_s: float) -> float:
+    """How near to its goal, 5 m to the north, a point comes that turns as slowly as decisions so far apart let it."""
+    mission = forest(frame_period_s)
+    rate_rad_s = MOST_TURN_RAD / (2.0 * frame_period_s + RESPONSE_S)
+    place, nearest, dt_s = np.array([-5.0, 0.0]), math.inf, 0.02
+    for _ in range(3000):
+        distance_m = float(np.linalg.norm(place))
+        nearest = min(nearest, distance_m)
+        off_rad = wrap_rad(math.atan2(-place[1], -place[0]) - course_rad)
+        course_rad += max(-rate_rad_s * dt_s, min(rate_rad_s * dt_s, off_rad))
+        speed = min(speed_m_s, mission._homing_m_s((-place[0], -place[1]), course_rad))
+        place = place + dt_s * speed * np.array([math.cos(course_rad), math.sin(course_rad)])
+    return nearest
 
 
 def test_a_bend_through_a_tree_is_taken_slower_with_frames_far_apart() -> None:
@@ -30,3 +52,13 @@ def test_with_frames_close_together_the_next_one_is_in_time() -> None:
 @pytest.mark.parametrize("obstacles", [np.empty((0, 2)), np.array([[9.0, -5.0]])], ids=["nothing", "far away"])
 def test_a_free_way_is_not_slowed(obstacles: np.ndarray) -> None:
     assert share(1.0, obstacles, AHEAD, ASIDE) == 1.0
+
+
+@pytest.mark.parametrize("frame_period_s", [0.2, 1.0])
+@pytest.mark.parametrize("off_deg", [0, 20, 45, 80, 120, 170])
+def test_a_goal_aside_is_turned_onto_and_not_circled(frame_period_s: float, off_deg: int) -> None:
+    assert nearest_m(frame_period_s, math.radians(off_deg), 4.0) < 0.5 * ForestParameters().goal_radius_m
+
+
+def test_a_goal_straight_ahead_is_not_slowed_for() -> None:
+    assert forest(1.0)._homing_m_s((5.0, 0.0), 0.0) > 4.0

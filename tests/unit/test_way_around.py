@@ -39,6 +39,14 @@ def test_it_takes_the_outermost_heading_that_is_wide_enough() -> None:
     assert around.heading(HEADINGS, free / 5.0) == 4, "in a narrow place six tenths of the best will do"
 
 
+def test_it_ends_where_nothing_is_in_the_way() -> None:
+    around = WayAround()
+    around.update(20.0, 0.3, 0)
+    assert around.update(20.0, 0.3, LATER_NS)
+    around.end(LATER_NS)
+    assert not around.update(20.0, 0.3, LATER_NS + S)
+
+
 def test_forgotten_before_the_mission_engages() -> None:
     around = WayAround()
     around.update(20.0, 0.3, 0)

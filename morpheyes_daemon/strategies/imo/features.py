@@ -5,8 +5,6 @@ Pyramidal Lucas-Kanade of OpenCV, started from where geometry expects the corner
 
 from __future__ import annotations
 
-from functools import partial
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +45,10 @@ def followed(before: Image, now: Image, uv: Array, guess: Array) -> tuple[Array,
     if not len(uv):
         return np.empty((0, 2)), np.zeros(0, dtype=np.bool_)
     start = np.where(np.isfinite(guess), guess, uv)
-    step = partial(follow, window_px=WINDOW_PX, levels=LEVELS, least_texture=1e-3, rounds=ROUNDS)
-    there, ok = step(before, now, uv, start)
-    back, ok_back = step(now, before, there, uv)
-    good = ok & ok_back & (np.linalg.norm(back - uv, axis=1) < BACK_PX)
-    return there, good
+    return follow(
+        before, now, uv, start,
+        window_px=WINDOW_PX, levels=LEVELS, least_texture=1e-3, rounds=ROUNDS, return_px=BACK_PX,
+    )  # fmt: skip
 
 
 def seen_by_both(frame: Frame, uv: Array, d_guess: Array) -> tuple[Array, Mask]:
