@@ -64,6 +64,8 @@ async def until(flight: RealtimeFlight, done: Callable[[], bool], limit_s: float
     while not done():
         assert clock.now_ns() < end_ns, f"{flight.daemon.guardian.state}: {flight.daemon.guardian.reason.text}"
         assert not flight.running.done()
+        if flight.simulator.verdict.done():
+            flight.simulator.verdict.result()  # raises what ended the simulator
         await ticker.wait()
 
 
