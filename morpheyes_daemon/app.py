@@ -151,6 +151,7 @@ class Daemon:
         gate, guardian, safety = self.gate, self.guardian, config.safety
         period_ns = round(S / config.camera.rate_hz)
         reaction_s = safety.dead_daemon_s
+        longest_s = safety.mission_periods / self.config.camera.rate_hz
         frame_ns = round(safety.frame_periods * period_ns)
         depth_ns = round(safety.depth_periods * period_ns)
         table = [
@@ -185,7 +186,7 @@ class Daemon:
             Task(
                 "mission",
                 lambda pulse: mission(
-                    self._strategy, self.track, self, guardian, topics, clock, reaction_s, pulse
+                    self._strategy, self.track, self, guardian, topics, clock, reaction_s, longest_s, pulse
                 ),
                 Reason.TASK_DIED,
             ),

@@ -5,7 +5,6 @@ Screen units (`_mm`, `_deg`) are allowed here and converted by the properties; e
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,7 +26,6 @@ class Footprint(Section):
     bar_depth_mm: float = Field(40.0, gt=5, lt=300, description="stereo bar, front to back")
     bar_height_mm: float = Field(30.0, gt=5, lt=300, description="stereo bar, top to bottom")
     camera_width_mm: float = Field(30.0, gt=1, lt=200, description="one camera; the bar is baseline + this wide")
-    mass_g: float = Field(780.0, gt=50, lt=20000)
 
     def width_m(self, baseline_m: float) -> float:
         """Widest extent, hull or bar, at a baseline."""
@@ -152,7 +150,7 @@ class SafetyConfig(Section):
 
     frame_periods: float = Field(3.0, ge=1, le=20, description="camera periods until a frame is stale")
     depth_periods: float = Field(3.0, ge=1, le=20, description="camera periods until a depth map is stale")
-    mission_periods: float = Field(3.0, ge=1, le=20)
+    mission_periods: float = Field(3.0, ge=1, le=20, description="camera periods that a mission command may last")
     vehicle_timeout_s: float = Field(0.3, gt=0.02, le=5)
     switch_timeout_s: float = Field(0.5, gt=0.05, le=5)
     supervisor_timeout_s: float = Field(0.25, gt=0.02, le=5)
@@ -208,11 +206,6 @@ class VehicleConfig(Section):
         if isinstance(self.servo, NoServoConfig):
             return self.servo.baseline_mm / 1e3, self.servo.baseline_mm / 1e3
         return self.servo.motion.min_baseline_mm / 1e3, self.servo.motion.max_baseline_mm / 1e3
-
-    @property
-    def tilt_up_rad(self) -> float:
-        """Tilt of the camera axis above the body's forward axis."""
-        return math.radians(self.camera.mount.tilt_up_deg)
 
 
 class MissionFile(Section):

@@ -52,12 +52,6 @@ def camera_uncertainty(calibration: Calibration) -> tuple[dict[str, float], dict
     return left, right
 
 
-def pose_uncertainty(calibration: Calibration, index: int) -> Array:
-    """Return one standard deviation (6,) of the rotation vector (rad) and translation (m) at one baseline."""
-    start = EYES + POSE * index
-    return np.asarray(np.sqrt(np.diag(calibration.solution.covariance)[start : start + POSE]))
-
-
 def _geometry(values: Array, size: tuple[int, int]) -> StereoGeometry:
     T_cam0_cam1 = pose(R_from_rotvec(values[EYES : EYES + 3]), values[EYES + 3 :])
     return StereoGeometry(camera_from_vector(values[:10], size), camera_from_vector(values[10:20], size), T_cam0_cam1)

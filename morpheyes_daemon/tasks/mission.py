@@ -6,7 +6,7 @@ import math
 from typing import Protocol
 
 from morpheyes_daemon.bus import Topics
-from morpheyes_daemon.clock import Clock
+from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.control.governor import Stopping
 from morpheyes_daemon.control.vehicle_track import VehicleTrack
 from morpheyes_daemon.messages import Intent, Perception
@@ -54,11 +54,13 @@ async def mission(
     topics: Topics,
     clock: Clock,
     reaction_s: float,
+    longest_s: float,
     pulse: Pulse,
 ) -> None:
     """Let the strategy decide on every percept; done or refused ends the flight in HOLD.
 
-    It thinks for milliseconds, and begins when a stick message has just gone out: that long the next can wait.
+    It thinks for milliseconds, and begins when a stick message has just gone out: that long the next can wait. No
+    command counts for more than `longest_s`, whatever a strategy says.
     """
     percepts = topics.perception.reader()
     while True:
@@ -72,7 +74,7 @@ async def mission(
             topics.track.publish(followed)
         command = strategy.decide(observation)
         topics.command.publish(command)
-        guardian.gate.renew(Lease.MISSION, command.expires_ns)
+        guardian.gate.renew(Lease.MISSION, min(command.expires_ns, observation.now_ns + round(longest_s * S)))
         if command.intent in (Intent.DONE, Intent.REFUSE):
             guardian.mission_over(command.reason or Reason.GOAL_REACHED, clock.now_ns())
         pulse.beat()

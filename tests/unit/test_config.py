@@ -1,9 +1,14 @@
 """Configuration and mission files: strict, and every error names file, line, key, what was found, what is allowed."""
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
+from pydantic import BaseModel
 
+import morpheyes_daemon
 from morpheyes_daemon.config import VehicleConfig
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.reasons import Reason
@@ -17,6 +22,9 @@ def errors(text: str) -> list[str]:
     with pytest.raises(ConfigError) as caught:
         parse_model(text, VehicleConfig, "config.yaml")
     return str(caught.value).splitlines()
+
+
+PACKAGE = Path(morpheyes_daemon.__file__).parent
 
 
 def test_the_shipped_files_are_good() -> None:
@@ -71,6 +79,21 @@ def test_a_strategys_parameters_are_checked_in_their_file(tmp_path: Path) -> Non
     path.write_text("strategy: forest\nparameters:\n  margin_m: 9\n", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"mine.yaml:3: parameters.margin_m: found 9"):
         load_mission(str(path))
+
+
+def test_every_setting_is_read_somewhere() -> None:
+    text = "".join(path.read_text() for path in PACKAGE.rglob("*.py") if path.name != "config.py")
+    unread = {name for name in settings(VehicleConfig) if not re.search(rf"\b{name}\b", text)}
+    assert not unread
+
+
+def settings(model: type[BaseModel]) -> Iterator[str]:
+    """Every name that a configuration may use."""
+    for name, field in model.model_fields.items():
+        yield name
+        for part in (field.annotation, *get_args(field.annotation)):
+            if isinstance(part, type) and issubclass(part, BaseModel):
+                yield from settings(part)
 
 
 def test_reason_numbers_are_used_once() -> None:

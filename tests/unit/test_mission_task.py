@@ -32,9 +32,9 @@ class Listed:
 
     def __init__(self) -> None:
         self.decided: list[tuple[int, int]] = []
-        self.leases: list[Lease] = []
+        self.leases: list[tuple[Lease, int]] = []
         self.over: Reason | None = None
-        self.gate = SimpleNamespace(renew=lambda lease, expires_ns: self.leases.append(lease))
+        self.gate = SimpleNamespace(renew=lambda *lease: self.leases.append(lease))
 
     def track(self, percept: int) -> None:
         """Nothing is followed."""
@@ -43,7 +43,7 @@ class Listed:
         """Done at the tenth percept."""
         self.decided.append((observation.now_ns, observation.percept))
         intent = Intent.DONE if observation.percept >= 10 else Intent.FLY
-        return SimpleNamespace(expires_ns=observation.now_ns + S, intent=intent, reason=None)
+        return SimpleNamespace(expires_ns=observation.now_ns + 60 * S, intent=intent, reason=None)
 
     def mission_over(self, reason: Reason, now_ns: int) -> None:
         """The flight is over."""
@@ -63,7 +63,7 @@ async def fly(listed: Listed, topics: Topics, last_s: float) -> None:
         mission(
             listed,  # type: ignore[arg-type]
             VehicleTrack(), SimpleNamespace(stopping=None), listed,  # type: ignore[arg-type]
-            topics, clock, 0.3, Pulse(clock),
+            topics, clock, 0.3, 0.5, Pulse(clock),
         ),
         publish(topics.perception, FRAMES_NS, percept),
         publish(topics.gate, STICKS_NS, lambda count, t_ns: t_ns),
@@ -82,7 +82,13 @@ def test_it_decides_on_every_percept_right_after_a_stick_message() -> None:
     run_virtual(fly(listed, topics, 1.0))
     assert [seq for _, seq in listed.decided[:20]] == list(range(1, 21))
     assert {t_ns for t_ns, _ in listed.decided} <= sent_ns
-    assert set(listed.leases) == {Lease.MISSION}
+
+
+def test_no_command_lasts_longer_than_it_may() -> None:
+    listed = Listed()
+    run_virtual(fly(listed, Topics.create(), 1.0))
+    wanted = [(Lease.MISSION, t_ns + S // 2) for t_ns, _ in listed.decided]
+    assert listed.leases == wanted
 
 
 def test_a_mission_that_is_done_says_so() -> None:

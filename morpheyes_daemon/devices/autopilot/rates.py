@@ -31,7 +31,6 @@ STREAMS = (
     Stream(dialect.MAVLINK_MSG_ID_SYS_STATUS, 2.0),
     Stream(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 2.0),
 )
-OWN_STREAMS = frozenset(stream.number for stream in STREAMS)
 
 
 async def request_streams(commands: CommandClient) -> list[str]:
