@@ -131,7 +131,7 @@ def largest_hole(inverse: FloatMap) -> tuple[Mask, float, bool]:
     found = split_inverse(smooth, np.zeros(smooth.shape, np.bool_), FLOW_SIGMA * float(np.median(np.abs(smooth))))
     if found is None:
         return np.zeros(smooth.shape, np.bool_), 0.0, False
-    return enclosed(found.far), found.separation, found.bimodal
+    return enclosed(found.clusters()[0]), found.separation, found.bimodal
 
 
 def _judged(scene: ScenePair, kind: str, flow: FloatMap, mask: Image) -> SceneIou:

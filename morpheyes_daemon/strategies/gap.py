@@ -199,6 +199,7 @@ class Gap(Strategy):
                 self._phase = Phase.CLOSE
             elif self._phase is Phase.CLOSE and self._closed(observation) and self._may_run(observation):
                 self._phase = Phase.RUN
+                self._crossing.begin(now_ns)
                 return self._run(observation)
         return self._hold(observation, opening, start, ahead, range_m)
 
@@ -303,9 +304,9 @@ class Gap(Strategy):
             return self._approach(observation)
         beyond_m = range_m + self._seen_beyond_m
         v = parameters.speed_m_s * ahead
-        after_s = self._crossing.to_wall_s(range_m, float(np.array(vehicle.v_ned_m_s) @ ahead))
-        opening = self._track.at(now_ns + round(after_s * S))
-        place = opening.p_m - after_s * opening.v_m_s  # a straight way that meets it as it moves then
+        left_s = self._crossing.left_s(range_m, float(np.array(vehicle.v_ned_m_s) @ ahead), now_ns)
+        opening = self._track.at(now_ns + round(left_s * S))
+        place = opening.p_m - left_s * opening.v_m_s  # a straight way that meets it as it moves then
         line = Line(now_ns, _three(place), _three(opening.v_m_s), gain_1_s=RUN_1_S, integral_1_s2=RUN_1_S2)
         return self._command(
             observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(), v_ned_m_s=_three(v),

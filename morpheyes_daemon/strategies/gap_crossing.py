@@ -34,6 +34,11 @@ class Crossing:
 
     parameters: GapParameters
     t_ns: int = 0
+    begun_ns: int = 0
+
+    def begin(self, now_ns: int) -> None:
+        """The run begins."""
+        self.begun_ns = now_ns
 
     def plan(self, track: PointTrack, yaw: PointTrack, watched_s: float, now_ns: int) -> None:
         """Keep to the crossing there is while it can still be reached and is slow; else take the slowest ahead."""
@@ -70,6 +75,12 @@ class Crossing:
     def run_ns(self) -> int:
         """Time from the stand-off to the wall."""
         return round(self.to_wall_s(self.parameters.stand_off_m, 0.0) * S)
+
+    def left_s(self, range_m: float, speed_m_s: float, now_ns: int) -> float:
+        """Return the time to the wall on the run; as planned while a lean that was commanded does not show as speed."""
+        planned_s = (self.begun_ns + self.run_ns - now_ns) / S
+        soonest_s = max(0.0, range_m) / self.parameters.speed_m_s
+        return min(self.to_wall_s(range_m, speed_m_s), max(planned_s, soonest_s))
 
     def to_wall_s(self, range_m: float, speed_m_s: float) -> float:
         """Return the time for a range: at the set speed, reached with about the lean that Loiter gives it."""

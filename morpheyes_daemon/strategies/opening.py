@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages import DepthMap, FloatMap, Pinhole
-from morpheyes_daemon.strategies.wall import Mask, Plane, Split
+from morpheyes_daemon.strategies.wall import Box, Mask, Plane, Split
 from morpheyes_daemon.transforms import Array
 
 CELLS = 160
@@ -37,7 +37,7 @@ TUNNEL_M = 0.10
 SAMPLES = 5000
 """Pixels of an opening, about, that tell what lies behind it."""
 
-COARSE_PX = 320
+COARSE_PX = 160
 """Holes are first looked for in about so many columns."""
 
 LEAST_PX = 40
@@ -136,25 +136,23 @@ def find_openings(depth: DepthMap, found: Split, way: Passage, silhouette: Silho
         return ()
     openings: list[Opening] = []
     for box, cut in _candidates(found, depth.pinhole.f_px / max(way.range_m, 0.2)):
-        hole = _largest(~found.wall[box])
-        if hole is None or (hole & found.far[box]).sum() < SEEN_THROUGH * hole.sum():
+        far, wall = found.clusters(box)
+        hole = _largest(~wall)
+        if hole is None or np.count_nonzero(hole & far) < SEEN_THROUGH * np.count_nonzero(hole):
             continue
-        openings.append(_opening(depth, found, way, silhouette, hole, box, cut))
+        openings.append(_opening(depth, way, silhouette, _Hole(hole, hole & far, wall, box, cut)))
         if len(openings) == MOST_OPENINGS:
             break
     return tuple(openings)
 
 
-Box = tuple[slice, slice]
-
-
 def _candidates(found: Split, px_per_m: float) -> Iterator[tuple[Box, bool]]:
     """Yield where holes may be, with a band around them, and whether they touch the image's edge: a coarse look."""
-    height, width = found.wall.shape
+    height, width = found.near.shape
     step = max(1, round(width / COARSE_PX))
-    coarse = np.ascontiguousarray(~found.wall[::step, ::step])
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(coarse.view(np.uint8), connectivity=4)
-    seen = np.bincount(labels[found.far[::step, ::step]], minlength=count)
+    far, wall = found.clusters((slice(None, None, step), slice(None, None, step)))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((~wall).view(np.uint8), connectivity=4)
+    seen = np.bincount(labels[far], minlength=count)
     pad = max(2, round(BAND_M * px_per_m)) + step
     for label in (np.argsort(-stats[1:count, cv2.CC_STAT_AREA])[: 3 * MOST_OPENINGS] + 1).tolist():
         x, y, w, h, area = (int(value) * step for value in stats[label])
@@ -175,27 +173,29 @@ def _largest(mask: Mask) -> Mask | None:
     return np.asarray(labels == label) if stats[label, cv2.CC_STAT_AREA] >= LEAST_PX else None
 
 
-def _opening(
-    depth: DepthMap,
-    found: Split,
-    way: Passage,
-    silhouette: Silhouette,
-    hole: Mask,
-    box: Box,
-    cut: bool,
-) -> Opening:
-    corner = np.array([box[1].start, box[0].start], dtype=np.float32)
-    outlines, _ = cv2.findContours(hole.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hole:
+    """Pixels of an opening, those of them that are far, and the wall around it, all within a box of the image."""
+
+    inside: Mask
+    far: Mask
+    wall: Mask
+    box: Box
+    cut: bool
+
+
+def _opening(depth: DepthMap, way: Passage, silhouette: Silhouette, hole: _Hole) -> Opening:
+    corner = np.array([hole.box[1].start, hole.box[0].start], dtype=np.float32)
+    outlines, _ = cv2.findContours(hole.inside.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     contour = max(outlines, key=len)[:, 0].astype(np.float32) + corner
-    far = hole & found.far[box]
-    z_m = float(np.median(1.0 / np.maximum(found.plane.at(contour.astype(np.float64)), 1e-3)))
-    raster = _raster(hole, contour, corner, way, silhouette)
+    z_m = float(np.median(1.0 / np.maximum(way.plane.at(contour.astype(np.float64)), 1e-3)))
+    raster = _raster(hole.inside, contour, corner, way, silhouette)
     band_px = max(2, round(BAND_M * depth.pinhole.f_px / max(way.range_m, 0.2)))
-    u, v = (float(c) for c in _safest_px(hole, far, found.wall[box], band_px) + corner)
+    u, v = (float(c) for c in _safest_px(hole, band_px) + corner)
     safest = Place(way.ned_of_pixel(u, v), _room_at(raster, way, u, v))
     places = _places(raster, way)
-    beyond_m = _beyond_m(depth, box, far, way, places[0], silhouette)
-    return Opening(contour, z_m, places, safest, *raster.extent_m, beyond_m, cut)
+    beyond_m = _beyond_m(depth, hole.box, hole.far, way, places[0], silhouette)
+    return Opening(contour, z_m, places, safest, *raster.extent_m, beyond_m, hole.cut)
 
 
 def _beyond_m(
@@ -218,11 +218,11 @@ def _beyond_m(
     return float(np.percentile(met, 3.0) - at[2]) if met.size else 0.0
 
 
-def _safest_px(hole: Mask, far: Mask, wall: Mask, band_px: int) -> FloatMap:
+def _safest_px(hole: _Hole, band_px: int) -> FloatMap:
     """Return the paper's x_s: median(F) if |F| >= |B|, else median(B); F is the wall's band around the contour."""
     kernel = np.ones((2 * band_px + 1, 2 * band_px + 1), np.uint8)
-    band = cv2.dilate(hole.view(np.uint8), kernel).view(np.bool_) & wall
-    chosen = band if band.sum() >= far.sum() else far
+    band = cv2.dilate(hole.inside.view(np.uint8), kernel).view(np.bool_) & hole.wall
+    chosen = band if np.count_nonzero(band) >= np.count_nonzero(hole.far) else hole.far
     return np.array([_median_index(chosen.sum(axis=0)), _median_index(chosen.sum(axis=1))], dtype=np.float32)
 
 
