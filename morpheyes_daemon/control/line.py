@@ -18,7 +18,10 @@ CLIMB_MOST_M_S = 0.5
 LEAN_LAG_S = 0.15
 """A wanted velocity takes hold so much later (VelocityTuning.lean_lag_s)."""
 
-ANSWER_S = 0.2
+CLIMB_GAIN_1_S = 4.0
+"""Climbing answers later than a lean does: a quicker way back overshoots."""
+
+ANSWER_S = 0.25
 """Where the vehicle will be after this is what is held against the line: without it the way back overshoots."""
 
 MISSED_MOST_M_S = 0.4
@@ -56,7 +59,7 @@ class LineKeeper:
         back = _across(
             (gain * north + missed[0] + moving[0], gain * east + missed[1] + moving[1]), (vn, ve), line.most_m_s
         )
-        climb = gain * down + missed[2] + moving[2]
+        climb = min(gain, CLIMB_GAIN_1_S) * down + missed[2] + moving[2]
         return vn + back[0], ve + back[1], vd + max(-CLIMB_MOST_M_S, min(CLIMB_MOST_M_S, climb))
 
     def _gathered(self, line: Line, off: Vector3, now_ns: int) -> Vector3:

@@ -37,7 +37,7 @@ class VelocityTuning:
     """
 
     response_1_s: float = 2.5
-    quick_response_1_s: float = 7.0
+    quick_response_1_s: float = 10.0
     steady_s: float = 0.7
     integral_1_s2: float = 0.3
     integral_limit_m_s2: float = 0.8

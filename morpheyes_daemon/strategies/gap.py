@@ -42,7 +42,7 @@ RANGE_SIGMA: Array = np.array([0.010, 0.003, 0.003])
 """One sigma of where an opening is seen along, across and down, per metre of range: a pixel."""
 
 ATTITUDE_LATE_S = 0.02
-"""An attitude's stamp may be late by this, which counts while the vehicle turns or nods."""
+"""An attitude's stamp may be late by this, which counts while the vehicle nods; before a wall it hardly turns."""
 
 YAW_SIGMA: Array = np.full(3, 0.02)
 """One sigma of a wall's heading, radians."""
@@ -65,7 +65,7 @@ STAND_M = 0.35
 TURNED_RAD = math.radians(3.0)
 SETTLED_M = 0.004
 
-HOLD_1_S, RUN_1_S, RUN_1_S2 = 0.6, 4.0, 0.5
+HOLD_1_S, RUN_1_S, RUN_1_S2 = 0.6, 8.0, 0.5
 """Gains on what is missing to the line and, on the run, on its integral.
 
 Gentle before the wall, since a vehicle that brakes looks up."""
@@ -154,8 +154,8 @@ class Gap(Strategy):
         self._seen_ns = percept.t_ns
         self._beyond_m.append(opening.beyond_m)
         p = self._scaled(np.array(place.p_ned_m), percept)
-        _, nods, turns = observation.at_exposure.rates_frd_rad_s
-        sigma = np.hypot(RANGE_SIGMA, ATTITUDE_LATE_S * np.array([0.0, turns, nods]))
+        _, nods, _ = observation.at_exposure.rates_frd_rad_s
+        sigma = np.hypot(RANGE_SIGMA, ATTITUDE_LATE_S * np.array([0.0, 0.0, nods]))
         sigma_m = np.hypot(sigma * max(0.5, opening.z_m), self._room_missed_m(place))
         self._track.see(percept.t_ns, p, sigma_m, opening.z_m)
         if self._phase is not Phase.RUN:

@@ -21,6 +21,9 @@ SLOW_M_S, TURNS_RAD = 0.2, math.radians(9.0)
 HORIZON_S, STEP_S = 10.0, 0.1
 """So far ahead the crossing is looked for, in such steps."""
 
+PATIENCE_S = 9.0
+"""For so long after the watch it waits for that; in as much again twice as much is taken."""
+
 EARLY_S, LATE_S = 0.15, 0.4
 """A run that would arrive so much before or after the planned crossing may begin: the mission decides at each frame."""
 
@@ -68,8 +71,8 @@ class Crossing:
         """Return how fast the opening moves and turns at a time; above 1 is too much, which waiting makes milder."""
         fast = float(np.linalg.norm(track.at(t_ns).v_m_s)) / SLOW_M_S
         turned = abs(float(yaw.at(t_ns).p_m[1] - yaw.middle[1])) / TURNS_RAD
-        watch_s = self.parameters.watch_s
-        return max(fast, turned) / (1.0 + max(0.0, watched_s - 2 * watch_s) / watch_s)
+        waited_s = watched_s - self.parameters.watch_s - PATIENCE_S
+        return max(fast, turned) / (1.0 + max(0.0, waited_s) / PATIENCE_S)
 
     @property
     def run_ns(self) -> int:

@@ -19,5 +19,5 @@ class GapParameters(StrategyParameters):
     confirm_frames: int = Field(5, ge=2, le=50, description="frames in a row that must show that it fits")
     off_line_m: float = Field(0.05, gt=0.005, le=0.5, description="how near to the line it must be to take its run")
     look_s: float = Field(12.0, gt=1, le=120, description="without an opening for so long it refuses")
-    watch_s: float = Field(9.0, gt=2, le=60, description="a moving opening is watched for so long before the run")
+    watch_s: float = Field(16.0, gt=2, le=60, description="a moving opening is watched for so long before the run")
     behind_m: float = Field(0.6, gt=0.2, le=10, description="past the wall by this it stops")

@@ -26,7 +26,9 @@ POINTING_RAD, POINTING_WALK_RAD_S = 0.008, 0.004
 MOVING_M_S, MOVING_M_S2 = 0.5, 0.4
 """Speed and acceleration of a moving wall that the filter reckons with."""
 
-KEEP_S = 14.0
+KEEP_S = 26.0
+"""Of a motion that repeats itself four periods tell the period to 0.2 %, two to 0.5 %, which is 20 mm at the wall."""
+
 LEAST_WAVE_S = 3.0
 PERIODS_S = np.geomspace(2.5, 16.0, 48)
 POINTING_S = 1.0
@@ -195,32 +197,31 @@ class Wave:
 def fit_wave(seen: list[Sighting], walk_m_s: float) -> Wave | None:
     """Return the wave through what was seen, None when that is too little or does not repeat.
 
-    Generalised least squares for each of some periods, the best of them refined twice. What was seen errs by its own
-    sigma, by the drift of the autopilot's position since, and by its range times a pointing error, one part of which
-    stays and is fitted, while the other comes and goes (an Ornstein-Uhlenbeck process).
+    Generalised least squares for each of some periods, the best of them refined twice, across and down each weighted
+    for itself. What was seen errs by its own sigma, by the drift of the autopilot's position since, and by its range
+    times a pointing error, one part of which stays and is fitted, while the other comes and goes (an
+    Ornstein-Uhlenbeck process).
     """
     t0_ns = seen[-1].t_ns
     t = np.array([(sighting.t_ns - t0_ns) / S for sighting in seen])
     if len(t) < 10 or -t[0] < LEAST_WAVE_S:
         return None
-    p, r = np.array([sighting.p_m for sighting in seen]), np.array([sighting.range_m for sighting in seen])
-    sigma_m = np.array([sighting.sigma_m[1:].max() for sighting in seen])
-    white = np.linalg.inv(np.linalg.cholesky(_covariance(t, r, sigma_m, walk_m_s)))
+    p, r = np.array([sighting.p_m[1:] for sighting in seen]), np.array([sighting.range_m for sighting in seen])
+    sigma_m = np.array([sighting.sigma_m[1:] for sighting in seen])
+    covariances = [_covariance(t, r, sigma, walk_m_s) for sigma in sigma_m.T]
+    known: list[Array] = [np.asarray(np.linalg.inv(covariance), np.float64) for covariance in covariances]
     periods = PERIODS_S[-1.6 * t[0] >= PERIODS_S]
     if not periods.size:
         return None
     for _ in range(3):
-        fits = [_harmonic(t, r, p, white, 2 * math.pi / period) for period in periods]
-        best = int(np.argmin([cost for cost, _ in fits]))
-        rate, x = 2 * math.pi / float(periods[best]), fits[best][1]
+        costs, fits = _harmonics(t, r, p, known, 2 * math.pi / periods)
+        best = int(np.argmin(costs))
+        rate, x = 2 * math.pi / float(periods[best]), fits[best]
         periods = np.linspace(periods[max(0, best - 1)], periods[min(len(periods) - 1, best + 1)], 9)
-    off, weight = (p - _columns(t, r, rate) @ x)[:, 1:], np.exp(t / LATELY_S)[:, None] ** 2
+    off, weight = p - _columns(t, r, np.array([rate]))[0] @ x, np.exp(t / LATELY_S)[:, None] ** 2
     rms_m = math.sqrt(float((off**2 * weight).sum() / weight.sum()))
-    return Wave(t0_ns, rate, x[0], _STILL * x[1], _STILL * x[2], rms_m) if rms_m < WAVE_FITS_M else None
-
-
-_STILL: Array = np.array([0.0, 1.0, 1.0])
-"""A wall does not move along."""
+    centre, sine, cosine, _ = np.pad(x, ((0, 0), (1, 0)))
+    return Wave(t0_ns, rate, centre, sine, cosine, rms_m) if rms_m < WAVE_FITS_M else None
 
 
 def _covariance(t: Array, r: Array, sigma_m: Array, walk_m_s: float) -> Array:
@@ -230,13 +231,23 @@ def _covariance(t: Array, r: Array, sigma_m: Array, walk_m_s: float) -> Array:
     return np.asarray(drift + pointing * r[:, None] * r[None, :] + np.diag(sigma_m**2 + 1e-8))
 
 
-def _columns(t: Array, r: Array, rate: float) -> Array:
-    return np.stack([np.ones_like(t), np.sin(rate * t), np.cos(rate * t), r], axis=1)
+def _columns(t: Array, r: Array, rates: Array) -> Array:
+    """Return (rates, n, 4) what centre, sine, cosine and pointing error make of what is seen."""
+    turns = rates[:, None] * t
+    return np.stack([np.ones_like(turns), np.sin(turns), np.cos(turns), np.broadcast_to(r, turns.shape)], axis=2)
 
 
-def _harmonic(t: Array, r: Array, p: Array, white: Array, rate: float) -> tuple[float, Array]:
-    """Return the cost across and down and (4, 3) centre, sine, cosine and pointing error of one rate's wave."""
-    A, y = white @ _columns(t, r, rate), white @ p
-    prior = np.array([0.0, WAVE_MOST_M, WAVE_MOST_M, POINTING_RAD])
-    x = np.linalg.solve(A.T @ A + np.diag([0.0, *prior[1:] ** -2.0]), A.T @ y)
-    return float(((y - A @ x)[:, 1:] ** 2).sum() + (x[3, 1:] ** 2).sum() / POINTING_RAD**2), np.asarray(x)
+def _harmonics(t: Array, r: Array, p: Array, known: list[Array], rates: Array) -> tuple[Array, Array]:
+    """Return the cost and (4, 2) centre, sine, cosine and pointing error, across and down, of each rate's wave.
+
+    `known` are the inverse covariances (n, n) of what was seen across and down.
+    """
+    columns, prior = _columns(t, r, rates), np.diag(np.array([np.inf, WAVE_MOST_M, WAVE_MOST_M, POINTING_RAD]) ** -2.0)
+    costs, fits = np.zeros(len(rates)), []
+    for seen, information in zip(p.T, known, strict=True):
+        weighted = (information @ columns).transpose(0, 2, 1)
+        b = weighted @ seen
+        x = np.linalg.solve(weighted @ columns + prior, b[..., None])[..., 0]
+        costs += seen @ information @ seen - (b * x).sum(axis=1)
+        fits.append(x)
+    return costs, np.stack(fits, axis=2)

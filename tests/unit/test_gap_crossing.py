@@ -10,16 +10,16 @@ from morpheyes_daemon.strategies.gap_parameters import GapParameters
 from morpheyes_daemon.strategies.gap_track import PointTrack
 
 S = 1_000_000_000
-WATCHED_S, NOW_NS = 12.0, 12 * S
+WATCHED_S, NOW_NS = 18.0, 18 * S
 SIGMA = np.full(3, 0.01)
 
 
 def tracks():
-    """An opening that sways by 0.5 m in a wall that turns, both watched for twelve seconds."""
+    """An opening that sways by 0.5 m in a wall that turns, both watched for eighteen seconds."""
     place, yaw = PointTrack(), PointTrack(walk_m_s=0.002)
     for track in (place, yaw):
         track.move()
-    for k in range(61):
+    for k in range(91):
         t_s = k / 5
         place.see(k * S // 5, np.array([4.0, 0.5 * math.sin(t_s), -1.4 + 0.15 * math.cos(t_s)]), SIGMA, 4.0)
         yaw.see(k * S // 5, np.array([0.0, math.radians(15) * math.sin(math.pi / 4 * t_s + 1.0), 0.0]), SIGMA)
@@ -31,7 +31,7 @@ def test_it_is_crossed_where_it_turns_back_and_the_wall_stands_across():
     crossing = Crossing(GapParameters())
     crossing.plan(place, yaw, WATCHED_S, NOW_NS)
     t_s = crossing.t_ns / S
-    # what is fitted to twelve seconds knows the speed to a few centimetres and the heading to a degree
+    # what is fitted to eighteen seconds knows the speed to a few centimetres and the heading to a degree
     assert math.hypot(0.5 * math.cos(t_s), 0.15 * math.sin(t_s)) < SLOW_M_S + 0.05
     assert abs(math.radians(15) * math.sin(math.pi / 4 * t_s + 1.0)) < TURNS_RAD + 0.02
     assert crossing.t_ns >= NOW_NS + crossing.run_ns
@@ -53,7 +53,7 @@ def test_a_plan_is_kept_until_its_run_is_due():
 def test_a_fast_moment_is_only_taken_after_long_waiting():
     place, yaw = tracks()
     crossing = Crossing(GapParameters())
-    middle_ns = round(4 * math.pi * S)
+    middle_ns = round(6 * math.pi * S)
     assert crossing.haste(middle_ns, place, yaw, WATCHED_S) > 2.0
     assert crossing.haste(middle_ns, place, yaw, 60.0) < 1.0
 
@@ -72,3 +72,12 @@ def test_the_set_speed_is_gathered_on_the_way():
     assert crossing.to_wall_s(4.0, 2.0) == pytest.approx(2.0)
     assert crossing.to_wall_s(4.0, 0.0) == pytest.approx(2.75)
     assert crossing.to_wall_s(-0.1, 2.0) == 0.0
+
+
+def test_a_run_that_has_begun_keeps_its_plan_until_the_speed_shows():
+    crossing = Crossing(GapParameters(speed_m_s=3.0, stand_off_m=4.0))
+    crossing.begin(NOW_NS)
+    run_s = crossing.run_ns / S
+    assert crossing.left_s(4.0, 0.0, NOW_NS) == pytest.approx(run_s)
+    assert crossing.left_s(4.0, 0.1, NOW_NS + S // 2) == pytest.approx(run_s - 0.5)
+    assert crossing.left_s(0.9, 3.0, NOW_NS + 3 * S) == pytest.approx(0.3)  # late: no sooner than at the set speed

@@ -91,3 +91,20 @@ def test_jumping_about_is_no_wave():
     jumps = [Sighting(k * S // 5, rng.normal(0.0, 0.4, 3), SIGMA, 4.0) for k in range(40)]
     assert fit_wave(jumps, POSITION_WALK_M_S) is None
     assert fit_wave([Sighting(k * S // 5, sway(k / 5), SIGMA, 4.0) for k in range(5)], POSITION_WALK_M_S) is None
+
+
+def test_four_periods_tell_the_period_better_than_two():
+    rng, errors = np.random.default_rng(2), {}
+    for seconds in (10, 25):
+        errors[seconds] = []
+        for _ in range(12):
+            drift = np.cumsum(rng.normal(0.0, 0.02 * math.sqrt(0.2), 5 * seconds))
+            seen = [
+                Sighting(k * S // 5, sway(k / 5) + np.array([0.0, drift[k], 0.0]), SIGMA, 4.0)
+                for k in range(5 * seconds)
+            ]
+            wave = fit_wave(seen, POSITION_WALK_M_S)
+            assert wave is not None
+            errors[seconds].append(wave.rate_rad_s - 1.0)
+    # the error of a frequency goes with the record's length to the power of -1.5: by 4 here, of few trials by 2
+    assert np.std(errors[25]) < np.std(errors[10]) / 2

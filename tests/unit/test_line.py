@@ -4,7 +4,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morpheyes_daemon.control.line import ANSWER_S, CLIMB_MOST_M_S, LEAN_LAG_S, MISSED_MOST_M_S, LineKeeper
+from morpheyes_daemon.control.line import (
+    ANSWER_S,
+    CLIMB_GAIN_1_S,
+    CLIMB_MOST_M_S,
+    LEAN_LAG_S,
+    MISSED_MOST_M_S,
+    LineKeeper,
+)
 from morpheyes_daemon.messages import Intent, Line, MissionCommand, VehicleState
 
 S = 1_000_000_000
@@ -48,6 +55,11 @@ def test_on_its_way_back_it_is_held_against_where_it_will_be():
     line, back = Line(0, (7.0, 0.0, -1.5), gain_1_s=2.0), (3.0, -0.3, 0.0)
     vehicle = VehicleState(p_ned_m=(1.0, 0.2, -1.5), v_ned_m_s=back)
     assert wanted_velocity(command(line), vehicle, 0)[1] == pytest.approx(-2.0 * (0.2 - 0.3 * ANSWER_S))
+
+
+def test_a_quick_line_is_climbed_to_no_quicker_than_climbing_answers():
+    line, vehicle = Line(0, (7.0, 0.0, -1.5), gain_1_s=2 * CLIMB_GAIN_1_S), VehicleState(p_ned_m=(1.0, 0.0, -1.4))
+    assert wanted_velocity(command(line), vehicle, 0)[2] == pytest.approx(-0.1 * CLIMB_GAIN_1_S)
 
 
 def test_what_stays_missing_is_asked_for_more_and_more():
