@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.config import Footprint
-from morpheyes_daemon.control.line import LineKeeper
+from morpheyes_daemon.control.line import LEAN_LAG_S, LineKeeper
 from morpheyes_daemon.messages import DepthSummary, Intent, VehicleState
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation
@@ -28,7 +28,7 @@ def opening(place=(WALL_M, 0.2, -1.4), room_m=0.04, z_m=4.0, cut=False):
 
 
 class Course:
-    """A vehicle that does at once what it is told, and a strategy that sees what `show` says."""
+    """A vehicle that does what it is told as soon as it leans, and a strategy that sees what `show` says."""
 
     def __init__(self, show, **parameters):
         self.strategy = Gap(GapParameters(**parameters), CRAFT)
@@ -58,10 +58,17 @@ class Course:
         self.phases.append(self.strategy._phase)
         self.ranges.append(range_m)
         self.baseline_m += max(-0.01, min(0.01, command.baseline_m - self.baseline_m))
-        v = self.keeper.wanted_velocity(command, self.vehicle, self.now_ns) if command.intent is Intent.FLY else (0, 0, 0)
-        north, east, down = (p + 0.2 * u for p, u in zip(self.vehicle.p_ned_m, v, strict=True))
-        self.vehicle = replace(self.vehicle, p_ned_m=(north, east, down), v_ned_m_s=tuple(float(u) for u in v))
+        for k in range(10):
+            self.move(command, self.now_ns + k * S // 50)
         return command
+
+    def move(self, command, now_ns):
+        """One stick period."""
+        flies = command.intent is Intent.FLY
+        wanted = self.keeper.wanted_velocity(command, self.vehicle, now_ns) if flies else (0.0, 0.0, 0.0)
+        v = [u + 0.02 / LEAN_LAG_S * (w - u) for u, w in zip(self.vehicle.v_ned_m_s, wanted, strict=True)]
+        north, east, down = (p + 0.02 * u for p, u in zip(self.vehicle.p_ned_m, v, strict=True))
+        self.vehicle = replace(self.vehicle, p_ned_m=(north, east, down), v_ned_m_s=tuple(float(u) for u in v))
 
     def fly(self, seconds):
         for _ in range(round(5 * seconds)):
