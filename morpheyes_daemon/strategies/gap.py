@@ -41,7 +41,7 @@ class Phase(StrEnum):
 RANGE_SIGMA: Array = np.array([0.010, 0.003, 0.003])
 """One sigma of where an opening is seen along, across and down, per metre of range: a pixel."""
 
-ATTITUDE_LATE_S = 0.02
+ATTITUDE_LATE_S = 0.03
 """An attitude's stamp may be late by this, which counts while the vehicle nods; before a wall it hardly turns."""
 
 YAW_SIGMA: Array = np.full(3, 0.02)
