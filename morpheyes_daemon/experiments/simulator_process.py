@@ -36,6 +36,7 @@ from morpheyes_daemon.simulation.pseudo_terminal import PseudoTerminal
 from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.serve_mavlink import MavlinkServer
 from morpheyes_daemon.simulation.sitl_vehicle import SitlVehicle
+from morpheyes_daemon.simulation.vehicle import Truth
 
 EXPOSURE_LAG_NS = 10 * MS
 """A pose is asked for this long after its moment, so that it lies between two that are known."""
@@ -144,17 +145,17 @@ async def _simulate(job: SimulatorJob, pipe: Connection) -> None:
 
 
 class TwinStage(Stage):
-    """A stage with the autopilot twin on the loop's own time."""
+    """A stage whose twin is brought up to the moment it is asked about, should the loop have been held up."""
 
-    async def catch_up(self) -> None:
-        """Advance the twin to the present."""
-        now_ns = self.clock.now_ns()
-        while now_ns - self.autopilot.autopilot.t_ns >= TICK_NS:
-            self.autopilot.advance(now_ns)
+    def truth(self, t_ns: int) -> Truth:
+        """Return where the vehicle really was; in the event loop only."""
+        while t_ns - self.autopilot.autopilot.t_ns >= TICK_NS:
+            self.autopilot.advance(t_ns)
+        return super().truth(t_ns)
 
 
 class SitlStage(Stage):
-    """A stage with somebody else's simulator."""
+    """A stage with somebody else's simulator, which can only be waited for."""
 
     def __init__(self, job: SimulatorJob, clock: Clock, sitl: SitlVehicle) -> None:
         super().__init__(job.scenario, job.config, clock, job.render_threads, sitl)
@@ -219,7 +220,9 @@ class Exposures:
         stage = self._stage
         self._seq += 1
         await stage.catch_up()
-        t_ns = stage.clock.now_ns() - stage.delivery_ns - EXPOSURE_LAG_NS
+        now_ns = stage.clock.now_ns()
+        stage.truth(now_ns)
+        t_ns = now_ns - stage.delivery_ns - EXPOSURE_LAG_NS
         return await asyncio.to_thread(stage.exposure(self._seq, t_ns))
 
 

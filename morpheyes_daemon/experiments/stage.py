@@ -109,7 +109,7 @@ class Stage:
         return self.vehicle.truth_at(t_ns)
 
     async def catch_up(self) -> None:
-        """Bring the vehicle up to the present, should the loop have been held up; in lockstep it never is."""
+        """Wait for a vehicle that says where it is only now and then; others know it at once."""
 
     def world_s(self, t_ns: int) -> float:
         """Time of the world, by which things in it move."""
