@@ -45,7 +45,8 @@ def clean_root(tmp_path: Path) -> Path:
 
 def dpkg(root: Path, *arguments: object) -> str:
     alone = ("--force-script-chrootless", "--force-depends", "--log=/dev/null")
-    return run("dpkg", f"--root={root}", *alone, *arguments)
+    path = f"{os.environ['PATH']}:/usr/local/sbin:/usr/sbin:/sbin"  # where dpkg looks for programs of its own
+    return run("dpkg", f"--root={root}", *alone, *arguments, env={**os.environ, "PATH": path})
 
 
 def files(root: Path) -> set[str]:
