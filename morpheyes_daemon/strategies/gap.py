@@ -136,16 +136,16 @@ class Gap(Strategy):
         """Follow the chosen opening, or choose one: the roomiest."""
         if self._phase in (Phase.BEHIND, Phase.OVER):
             return
-        whole = [opening for opening in percept.openings if not opening.cut]
-        sure = percept.scale_sigma < SURE_SCALE
-        if not whole or not (sure or self._track.count):
-            return
         if self._phase is not Phase.RUN and percept.t_ns - self._seen_ns > FORGOTTEN_S * S:
             self._track, self._room, self._phase = PointTrack(self._yaw_rad), [], Phase.APPROACH
+        usable = [opening for opening in percept.openings if not opening.cut or self._may_be_cut(opening)]
+        sure = percept.scale_sigma < SURE_SCALE
+        if not usable or not (sure or self._track.count):
+            return
         if self._track.count:
-            found = tracked_place(whole, self._track.at(percept.t_ns).p_m, self._ahead(), sure)
+            found = tracked_place(usable, self._track.at(percept.t_ns).p_m, self._ahead(), sure)
         else:
-            roomiest = max(whole, key=lambda opening: opening.places[0].clearance_m)
+            roomiest = max(usable, key=lambda opening: opening.places[0].clearance_m)
             found = roomiest, roomiest.places[0]
         if found is None:
             return
@@ -167,6 +167,14 @@ class Gap(Strategy):
         if self._phase in (Phase.APPROACH, Phase.CLOSE) and self._track.spread_m(3.0) > MOVES_M:
             self._track.move()
             self._yaw.move()
+
+    def _may_be_cut(self, opening: Opening) -> bool:
+        """Of an opening that is followed a part may be out of view, as long as the vehicle fits through what is seen.
+
+        On the run only if it was so before: there the edges leave the view one by one, and the place goes with them.
+        """
+        before = self._phase is not Phase.RUN or (self._chosen is not None and self._chosen.cut)
+        return before and self._track.count > 0 and opening.places[0].clearance_m >= self.parameters.margin_m
 
     def _room_missed_m(self, place: Place) -> float:
         """How much less room is seen than was measured: so much of the opening may be missing on one side."""

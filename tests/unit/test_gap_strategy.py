@@ -179,3 +179,23 @@ def test_an_opening_forgotten_while_the_eyes_close_is_measured_anew():
 def test_an_opening_that_is_cut_is_not_chosen():
     course = Course(lambda range_m: seen_from_afar(range_m, cut=True), look_s=3.0)
     assert course.fly(10.0).intent is Intent.REFUSE
+
+
+@pytest.mark.parametrize(("room_m", "intent"), [(0.04, Intent.DONE), (-0.02, Intent.REFUSE)])
+def test_an_opening_that_is_followed_may_leave_the_view_in_part_while_it_fits_through_the_rest(room_m, intent):
+    def show(range_m):
+        near = range_m < 5.5
+        return seen_from_afar(range_m, cut=near, room_m=room_m if near else 0.04)
+
+    assert Course(show, look_s=3.0).fly(30.0).intent is intent
+
+
+def test_an_opening_forgotten_is_not_taken_up_again_from_a_part_of_it():
+    def show(range_m):
+        away = course.now_ns > 13 * S
+        gone = away and course.now_ns < 16 * S
+        return [] if gone else seen_from_afar(range_m, cut=away)
+
+    course = Course(lambda range_m: [], look_s=3.0)
+    course.show = show
+    assert course.fly(30.0).intent is Intent.REFUSE
