@@ -128,7 +128,7 @@ def sim_config(
 def fly(plan: FlightPlan, watchers: Watchers | None = None) -> Summary:
     """Fly `plan` to its end on a virtual clock and return the summary."""
     summary = run_virtual(_fly(plan, watchers or Watchers()))
-    gc.collect()  # a flight is one knot of references, 300 MB that a campaign would pile up
+    gc.collect()  # a flight is one knot of references, images and all, that a campaign would pile up
     return summary
 
 

@@ -86,7 +86,7 @@ class Judge:
         ticker = Ticker(self._stage.clock, RATE_HZ)
         while True:
             await ticker.wait()
-            await self._stage.catch_up()
+            await self._stage.vehicle.catch_up()
             now_ns = self._stage.clock.now_ns()
             if self._guardian.state is State.ENGAGED and not self._engaged_ns:
                 self._engaged_ns = now_ns

@@ -35,7 +35,6 @@ from morpheyes_daemon.simulation.frame_server import FrameServer
 from morpheyes_daemon.simulation.pseudo_terminal import PseudoTerminal
 from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.serve_mavlink import MavlinkServer
-from morpheyes_daemon.simulation.sitl_vehicle import SitlVehicle
 from morpheyes_daemon.simulation.vehicle import Truth
 
 EXPOSURE_LAG_NS = 10 * MS
@@ -133,15 +132,17 @@ async def _simulate(job: SimulatorJob, pipe: Connection) -> None:
     if job.sitl is not None:
         async with open_sitl(job.sitl, clock) as (vehicle, crew):
             # in a thread, since the SITL goes on talking
-            stage = await asyncio.to_thread(SitlStage, job, clock, vehicle)
+            stage = await asyncio.to_thread(
+                Stage, job.scenario, job.config, clock, job.render_threads, vehicle
+            )
             vehicle.stand_at(*stage.world.start_ned_m[:2])
             await _fly(job, pipe, stage, crew, job.sitl)
             await crew.land()
         return
-    twin_stage = TwinStage(job.scenario, job.config, clock, job.render_threads)
-    autopilot, station = twin_stage.autopilot, make_crew(twin_stage)
-    async with MavlinkServer(autopilot, port=0) as server, _background(autopilot.run(), station.run()):
-        await _fly(job, pipe, twin_stage, station, server.url)
+    stage = TwinStage(job.scenario, job.config, clock, job.render_threads)
+    station = make_crew(stage)
+    async with MavlinkServer(stage.autopilot, port=0) as server, _background(stage.autopilot.run(), station.run()):
+        await _fly(job, pipe, stage, station, server.url)
 
 
 class TwinStage(Stage):
@@ -152,18 +153,6 @@ class TwinStage(Stage):
         while t_ns - self.autopilot.autopilot.t_ns >= TICK_NS:
             self.autopilot.advance(t_ns)
         return super().truth(t_ns)
-
-
-class SitlStage(Stage):
-    """A stage with somebody else's simulator, which can only be waited for."""
-
-    def __init__(self, job: SimulatorJob, clock: Clock, sitl: SitlVehicle) -> None:
-        super().__init__(job.scenario, job.config, clock, job.render_threads, sitl)
-        self._sitl = sitl
-
-    async def catch_up(self) -> None:
-        """Hear what the SITL said meanwhile."""
-        await self._sitl.catch_up()
 
 
 async def _fly(job: SimulatorJob, pipe: Connection, stage: Stage, crew: Crew, url: str) -> None:
@@ -219,7 +208,7 @@ class Exposures:
         """Expose now and return the pair."""
         stage = self._stage
         self._seq += 1
-        await stage.catch_up()
+        await stage.vehicle.catch_up()
         now_ns = stage.clock.now_ns()
         stage.truth(now_ns)
         t_ns = now_ns - stage.delivery_ns - EXPOSURE_LAG_NS
@@ -229,7 +218,7 @@ class Exposures:
 async def _report(stage: Stage, heard: Heard, pipe: Connection, began_ns: int) -> None:
     clock: Clock = stage.clock
     while True:
-        await stage.catch_up()
+        await stage.vehicle.catch_up()
         now_ns = clock.now_ns()
         truth = stage.truth(now_ns)
         distance_m = stage.world.to_goal_m(truth.p_ned_m)

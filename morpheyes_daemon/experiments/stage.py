@@ -58,6 +58,9 @@ class FlyingVehicle(Protocol):
     radio: Radio
     drift: float
 
+    async def catch_up(self) -> None:
+        """Wait until the present is known, where that is told only now and then."""
+
     def truth_at(self, t_ns: int) -> Truth:
         """Return where the vehicle was; InputError when that is not known."""
 
@@ -107,9 +110,6 @@ class Stage:
     def truth(self, t_ns: int) -> Truth:
         """Where the vehicle really was."""
         return self.vehicle.truth_at(t_ns)
-
-    async def catch_up(self) -> None:
-        """Wait for a vehicle that says where it is only now and then; others know it at once."""
 
     def world_s(self, t_ns: int) -> float:
         """Time of the world, by which things in it move."""

@@ -30,33 +30,24 @@ def follow(
     gradients, per pixel, below which a point is not found; `rounds` of improvement on each level at most. With
     `return_px` only those count as found that the way back leads home to within so much.
     """
-    step = partial(_step, window_px=window_px, levels=levels, least_texture=least_texture, rounds=rounds)
-    found, good = step(first, second, uv, guess)
-    if return_px is not None:
-        back, home = step(second, first, found, uv)
-        good &= home & (np.abs(back - uv).max(axis=1, initial=0.0) < return_px)
-    return found, good
-
-
-def _step(
-    first: Image,
-    second: Image,
-    uv: Array,
-    guess: Array,
-    window_px: int,
-    levels: int,
-    least_texture: float,
-    rounds: int,
-) -> tuple[Array, NDArray[np.bool_]]:
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        first,
-        second,
-        np.ascontiguousarray(uv, dtype=np.float32).reshape(-1, 1, 2),
-        np.array(guess, dtype=np.float32).reshape(-1, 1, 2),
+    step = partial(
+        cv2.calcOpticalFlowPyrLK,
         winSize=(window_px, window_px),
         maxLevel=levels,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, rounds, 0.01),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=least_texture,
     )
-    return np.asarray(found, dtype=np.float64).reshape(-1, 2), np.asarray(status).ravel() == 1
+    points = _points(uv)
+    there, status, _ = step(first, second, points, _points(guess))
+    found, good = there.reshape(-1, 2), status.ravel() == 1
+    if return_px is not None:
+        back, status, _ = step(second, first, there, points.copy())
+        off = np.abs(back.reshape(-1, 2) - uv).max(axis=1, initial=0.0)
+        good &= (status.ravel() == 1) & (off < return_px)
+    return found.astype(np.float64), good
+
+
+def _points(uv: Array) -> NDArray[np.float32]:
+    """Return pixels (n, 2) as OpenCV takes them; a copy, since it writes the result over a guess."""
+    return np.array(uv, dtype=np.float32).reshape(-1, 1, 2)

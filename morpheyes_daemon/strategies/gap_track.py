@@ -27,7 +27,7 @@ MOVING_M_S, MOVING_M_S2 = 0.5, 0.4
 """Speed and acceleration of a moving wall that the filter reckons with."""
 
 KEEP_S = 26.0
-"""Of a motion that repeats itself four periods tell the period to 0.2 %, two to 0.5 %, which is 17 mm at the wall."""
+"""The more periods of a sway are kept in mind, the better they tell the period, on which the place at the wall hangs."""
 
 LEAST_WAVE_S = 3.0
 PERIODS_S = np.geomspace(2.5, 16.0, 48)
