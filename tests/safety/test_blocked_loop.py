@@ -10,6 +10,7 @@ from morpheyes_daemon.clock import MS, VirtualLoop, run_virtual
 from morpheyes_daemon.config import NoServoConfig
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.tasks.health import LISTEN_HZ
 from tests.noisy_daemon import NoisyDaemon
 
 
@@ -17,7 +18,7 @@ from tests.noisy_daemon import NoisyDaemon
 def test_neutral_is_the_first_thing_after(held_up_s: float, noticed: bool) -> None:
     async def life() -> None:
         async with NoisyDaemon(NoServoConfig(backend="none")) as noisy:
-            await noisy.pass_time(0.5)
+            await noisy.pass_time(0.51)  # between two stick periods
             noisy.links["autopilot"].on_bytes = lambda data: None  # it would say that nobody has armed it
             machine = noisy.daemon.guardian.machine
             machine.state, machine.since_ns = State.ENGAGED, noisy.clock.now_ns()
@@ -34,5 +35,8 @@ def test_neutral_is_the_first_thing_after(held_up_s: float, noticed: bool) -> No
             if noticed:
                 assert noisy.overrides[before] == (1500, 1500, 1500, 1500)
                 assert "held up for" in late[0].text
+            await noisy.pass_time(0.3)
+            health = noisy.daemon.topics.health.get()
+            assert held_up_s - 1.0 / LISTEN_HZ <= health.worst_lateness_ms / 1e3 <= held_up_s
 
     run_virtual(life())

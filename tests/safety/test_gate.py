@@ -249,6 +249,12 @@ def test_the_rate_counts_the_time_that_has_passed() -> None:
     assert bench.step(dt_ns=100_000).roll_us == 1504, "rounded towards neutral"
 
 
+def test_a_stick_a_microsecond_away_stays_there_though_no_time_has_passed() -> None:
+    bench = Bench()
+    bench.reach(1501, 1489, 1510, 1505)
+    assert bench.step(dt_ns=0).widths_us == (1501, 1489, 1510, 1505)
+
+
 def test_widths_are_whole_microseconds() -> None:
     bench = Bench()
     bench.offer(1510.6, 1480.4, 1510.5, 1505.0)
@@ -403,5 +409,6 @@ def test_the_widest_limits_are_taken() -> None:
     widest = StickLimits((800,) * 4, (2200,) * 4, (800, 2200, 1500, 1500))
     assert widest.neutral == (800, 2200, 1500, 1500)
     assert widest.slew_us_s == 4000.0
+    assert replace(LIMITS, slew_us_s=1.0).slew_us_s == 1.0
     with pytest.raises(DeviceError, match=r"ranges from 1500 over 1400 to 1600 us.*calibrate the radio"):
         StickLimits((1500,) * 4, (1600,) * 4, (1400,) * 4)

@@ -64,6 +64,26 @@ def test_what_is_missing_is_named_one_by_one() -> None:
     is_in(cockpit, State.STANDBY, Reason.READY)
 
 
+def test_what_one_source_no_longer_misses_hides_nothing_that_another_does() -> None:
+    guardian = Actor().guardian
+    guardian.set_missing(Reason.DOCTOR_SAYS_NO, "doctor")
+    assert guardian.missing is Reason.STARTED
+    guardian.set_missing(None)
+    assert guardian.missing is Reason.DOCTOR_SAYS_NO
+    guardian.set_missing(None, "another")
+    assert guardian.missing is Reason.DOCTOR_SAYS_NO
+    guardian.set_missing(None, "doctor")
+    assert guardian.missing is None
+
+
+def test_a_vehicle_without_stamps_is_not_heard_in_the_clocks_first_instants() -> None:
+    actor = Actor(now_ns=100 * MS)
+    actor.heartbeat()
+    assert not actor.guardian.gate.is_fresh(Lease.VEHICLE, actor.now_ns)
+    actor.motion()
+    assert actor.guardian.gate.is_fresh(Lease.VEHICLE, actor.now_ns)
+
+
 @pytest.mark.parametrize("lease", Lease)
 def test_each_lease_is_needed_to_be_ready(lease: Lease) -> None:
     cockpit = Cockpit().into(State.STANDBY)
@@ -201,6 +221,21 @@ def test_a_flip_at_the_wrong_time_is_refused_and_needs_another(changes: dict[str
     cockpit.run(0.3)
     is_in(cockpit, State.STANDBY, Reason.READY)
     cockpit.engage()
+
+
+def test_a_flip_while_booting_is_not_used_up_before_it_can_engage() -> None:
+    cockpit = Cockpit()
+    cockpit.set_limits(LIMITS)
+    cockpit.set_missing(None)
+    cockpit.heartbeat(armed=False, landed=True)
+    cockpit.heartbeat(armed=True, landed=False)
+    cockpit.run(0.3)
+    cockpit.switch_us = ON_US
+    cockpit.run(0.4)
+    is_in(cockpit, State.BOOT, Reason.STARTED)
+    cockpit.guardian.boot_done(cockpit.now_ns)
+    cockpit.run(0.1)
+    assert cockpit.state is State.ENGAGED
 
 
 def test_a_refusal_is_forgotten_with_the_switch_off() -> None:
@@ -500,6 +535,18 @@ def test_the_end_of_a_mission_that_nobody_flies_changes_nothing(state: State) ->
     assert cockpit.sent[count:] == []
 
 
+def test_a_stop_that_somebody_asked_for_is_told_from_a_want() -> None:
+    for stop in (Reason.GOAL_REACHED, Reason.MISSION_REFUSED):
+        cockpit = Cockpit().engage()
+        cockpit.mission_over(stop)
+        assert cockpit.guardian.reason in NOT_RESUMED
+    cockpit = Cockpit().engage()
+    cockpit.shutdown()
+    assert cockpit.guardian.reason in NOT_RESUMED
+    assert Cockpit().into(State.BRAKING).guardian.reason not in NOT_RESUMED
+    assert Cockpit().into(State.FAULT).guardian.reason not in NOT_RESUMED
+
+
 def test_reasons_that_are_flown_on_are_no_stops() -> None:
     assert not RESUMED & set(NOT_RESUMED)
     assert {LEASE_REASONS[lease] for lease in OWN} == RESUMED
@@ -529,6 +576,24 @@ def test_a_fault_cleared_at_once_is_not_flown_on_though_all_is_fresh() -> None:
     assert actions(cockpit, 5.0) == {Action.NEUTRAL}
 
 
+@pytest.mark.parametrize("reason", sorted(RESUMED))
+def test_a_lighter_reason_after_a_fault_revives_no_hope_of_flying_on(reason: Reason) -> None:
+    cockpit = Cockpit().engage()
+    cockpit.fault(Reason.TASK_DIED)
+    cockpit.fault(reason)
+    assert actions(cockpit, 5.0) == {Action.NEUTRAL}
+
+
+def test_of_two_complaints_in_one_braking_the_first_stays() -> None:
+    cockpit = Cockpit().engage()
+    cockpit.said["ekf_flags"] = 0
+    cockpit.run(0.1)
+    is_in(cockpit, State.BRAKING, Reason.EKF_UNHEALTHY)
+    cockpit.said["system_status"] = 5
+    cockpit.run(0.1)
+    is_in(cockpit, State.BRAKING, Reason.EKF_UNHEALTHY)
+
+
 def test_a_fault_that_lasts_is_shown_after_the_pilot_took_over() -> None:
     cockpit = Cockpit().engage()
     cockpit.fault(Reason.CAMERA_LOST)
@@ -549,6 +614,7 @@ def test_several_faults_are_all_waited_for() -> None:
     cockpit.period()
     is_in(cockpit, State.FAULT, Reason.TASK_DIED)
     cockpit.clear(Reason.TASK_DIED, "sticks")
+    assert cockpit.state is State.FAULT
     cockpit.period()
     is_in(cockpit, State.FAULT, Reason.TASK_DIED)
     cockpit.clear(Reason.TASK_DIED, "mission")
@@ -560,6 +626,17 @@ def test_several_faults_are_all_waited_for() -> None:
     cockpit.clear(Reason.SERVO_LOST)
     cockpit.period()
     is_in(cockpit, State.STANDBY, Reason.READY)
+
+
+def test_a_fault_and_its_end_without_a_source_are_the_same_fault() -> None:
+    cockpit = Cockpit().stand_by()
+    cockpit.guardian.fault(Reason.SERVO_LOST, cockpit.now_ns)
+    assert cockpit.state is State.FAULT
+    cockpit.guardian.clear(Reason.SERVO_LOST, cockpit.now_ns, "")
+    assert cockpit.state is State.PREFLIGHT
+    cockpit.guardian.fault(Reason.SERVO_LOST, cockpit.now_ns, "")
+    cockpit.guardian.clear(Reason.SERVO_LOST, cockpit.now_ns)
+    assert cockpit.state is State.PREFLIGHT
 
 
 def test_clearing_what_never_failed_changes_nothing() -> None:
@@ -625,6 +702,21 @@ def test_a_lost_link_is_let_go_after_neutral_for_a_while() -> None:
     cockpit.run(0.2)
     assert actions(cockpit, 20.0) == {Action.SILENT}, "the link's return takes nothing from the pilot"
     is_in(cockpit, State.RELEASED, Reason.LINK_LOST)
+
+
+def test_a_link_lost_in_the_very_period_after_engaging_is_let_go_too() -> None:
+    cockpit = Cockpit().stand_by()
+    cockpit.switch_us = ON_US
+    cockpit.run(0.16)
+    cockpit.silent.add(Lease.LINK)
+    while cockpit.state is not State.ENGAGED:
+        cockpit.period()
+    cockpit.wait(round(0.48 * S))
+    cockpit.period()
+    is_in(cockpit, State.BRAKING, Reason.LINK_LOST)
+    assert cockpit.guardian.since_ns == cockpit.now_ns
+    assert actions(cockpit, 1.98) == {Action.NEUTRAL}
+    assert cockpit.period().action is Action.RELEASE
 
 
 def test_a_link_that_comes_and_goes_is_counted_anew() -> None:
