@@ -49,6 +49,7 @@ def sticks(
         ("stick messages", f"{found.intervals} in {found.minutes:g} minutes, {found.frames} frames seen"),
         ("interval", _beat(found.p50_s, found.p99_s, found.max_s)),
         ("loop lateness", f"{found.worst_lateness_ms:.1f} ms at worst"),
+        ("taken by the host", f"{found.stolen_s:.1f} s of processor time, of a virtual machine"),
         ("at the end", found.final_state),
     ]
     say(asdict(found), rows, as_json)
