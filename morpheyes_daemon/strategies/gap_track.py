@@ -218,7 +218,8 @@ def fit_wave(seen: list[Sighting], walk_m_s: float) -> Wave | None:
         best = int(np.argmin(costs))
         rate, x = 2 * math.pi / float(periods[best]), fits[best]
         periods = np.linspace(periods[max(0, best - 1)], periods[min(len(periods) - 1, best + 1)], 9)
-    off, weight = p - _columns(t, r, np.array([rate]))[0] @ x, np.exp(t / LATELY_S)[:, None] ** 2
+    off = p - _columns(t, r, np.array([rate]))[0] @ x
+    weight = (np.exp(t / LATELY_S)[:, None] * sigma_m.min(axis=0) / sigma_m) ** 2
     rms_m = math.sqrt(float((off**2 * weight).sum() / weight.sum()))
     centre, sine, cosine, _ = np.pad(x, ((0, 0), (1, 0)))
     return Wave(t0_ns, rate, centre, sine, cosine, rms_m) if rms_m < WAVE_FITS_M else None

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.gap_crossing import SLOW_M_S, TURNS_RAD, Crossing
+from morpheyes_daemon.strategies.gap_crossing import KEPT_S, SLOW_M_S, TURNS_RAD, Crossing
 from morpheyes_daemon.strategies.gap_parameters import GapParameters
 from morpheyes_daemon.strategies.gap_track import PointTrack
 
@@ -78,6 +78,13 @@ def test_a_run_that_has_begun_keeps_its_plan_until_the_speed_shows():
     crossing = Crossing(GapParameters(speed_m_s=3.0, stand_off_m=4.0))
     crossing.begin(NOW_NS)
     run_s = crossing.run_ns / S
-    assert crossing.left_s(4.0, 0.0, NOW_NS) == pytest.approx(run_s)
-    assert crossing.left_s(4.0, 0.1, NOW_NS + S // 2) == pytest.approx(run_s - 0.5)
-    assert crossing.left_s(0.9, 3.0, NOW_NS + 3 * S) == pytest.approx(0.3)  # late: no sooner than at the set speed
+    assert crossing.arrives_s(4.0, 0.0, NOW_NS) == pytest.approx(run_s)
+    assert crossing.arrives_s(4.0, 0.1, NOW_NS + S // 2) == pytest.approx(run_s - 0.5)
+    assert crossing.arrives_s(0.9, 3.0, NOW_NS + 3 * S) == pytest.approx(0.3)  # late: no sooner than at the set speed
+
+
+@pytest.mark.parametrize(("planned_s", "left_s"), [(0.35, 0.35), (0.25, 0.25), (2.0, 0.3 + KEPT_S), (-1.0, 0.3 - KEPT_S)])
+def test_the_opening_is_met_at_the_planned_crossing_unless_it_is_reached_at_quite_another_time(planned_s, left_s):
+    crossing = Crossing(GapParameters(speed_m_s=3.0), t_ns=NOW_NS + round(planned_s * S), begun_ns=NOW_NS - 3 * S)
+    assert crossing.left_s(0.9, 3.0, NOW_NS) == pytest.approx(left_s)
+    assert crossing.left_s(-1.0, 3.0, NOW_NS + 9 * S) == 0.0

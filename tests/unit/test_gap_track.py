@@ -66,6 +66,14 @@ def test_a_swaying_point_is_led_by_eyes_that_point_aside():
     assert track.at(round((t_s + 0.4) * S)).p_m[1:] == pytest.approx(sway(t_s + 0.4)[1:], abs=0.012)
 
 
+def test_a_sight_that_may_be_far_off_leaves_the_wave_as_it_was():
+    track, t_s = watched(sway, 12.0, moves=True)
+    before = track.at(round((t_s + 0.5) * S)).p_m
+    track.see(round((t_s + 0.2) * S), sway(t_s + 0.2) + (0.0, 0.6, 0.0), np.array([0.02, 0.6, 0.6]))
+    assert track.wave is not None
+    assert track.at(round((t_s + 0.5) * S)).p_m[1:] == pytest.approx(before[1:], abs=0.005)
+
+
 def test_a_moving_point_without_a_wave_is_led_by_its_speed():
     track, t_s = watched(lambda t: np.array([4.0, 0.4 * t, -1.5]), 2.4, noise_m=0.005, moves=True)
     assert track.wave is None
