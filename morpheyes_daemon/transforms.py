@@ -85,6 +85,14 @@ def R_from_q(q: Array) -> Array:
     )
 
 
+def rotvec_from_R(R: Array) -> Array:
+    """Return the rotation vector (3,), at most pi long, of a rotation matrix (3, 3)."""
+    w, *xyz = q_from_R(R).tolist()
+    half_sine = math.hypot(*xyz)
+    scale = 2.0 if half_sine < 1e-12 else 2.0 * math.atan2(half_sine, w) / half_sine
+    return np.array(xyz) * scale
+
+
 def pose(R: Array, t: Array) -> Array:
     """Return T (4, 4) with rotation R (3, 3) and translation t (3,)."""
     T = np.eye(4)

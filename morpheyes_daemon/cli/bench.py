@@ -19,7 +19,7 @@ app = typer.Typer(help="Time the sticks, the depth and the renderer on this mach
 
 Size = Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")]
 Repeats = Annotated[int, typer.Option(min=3, help="Timed runs; the first two are warm-up and left out.")]
-Calibration = Annotated[str, typer.Option(help="'solved' from rendered boards, 'exact', or a calibration file.")]
+Calibration = Annotated[str, typer.Option(help="'solved', 'mounted', 'exact', or a calibration file.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the figures as JSON and nothing else.")]
 
 app.command()(gap)

@@ -16,7 +16,7 @@ from morpheyes_daemon.cli.figures import say, times_text
 def gap(
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "640x480",
     repeats: Annotated[int, typer.Option(min=3, help="Views, of walls with every shape of opening.")] = 24,
-    calibration: Annotated[str, typer.Option(help="'solved', 'exact', or a calibration file.")] = "solved",
+    calibration: Annotated[str, typer.Option(help="'solved', 'mounted', 'exact', or a calibration file.")] = "solved",
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON and nothing else.")] = False,
 ) -> None:
     """Time gap detection on one core, with and without depth, beside a detector by stacked optical flow."""

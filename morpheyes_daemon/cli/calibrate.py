@@ -19,6 +19,7 @@ from morpheyes_daemon.cli.calibrate_live import (
     check,
     repeatability,
 )
+from morpheyes_daemon.cli.calibrate_mount import mount
 
 if TYPE_CHECKING:
     from morpheyes_daemon.calibration.boards import Board
@@ -81,7 +82,12 @@ def render(
     baselines_mm: Annotated[
         str, typer.Option("--baselines", help="How many, equally spaced over 100-300 mm, or lengths such as 100,200.")
     ] = "10",
-    views: Annotated[int, typer.Option("--views", min=3, max=200, help="Pairs per baseline.")] = 12,
+    views: Annotated[
+        int | None, typer.Option("--views", min=3, max=200, help="Pairs per baseline; default: 12, for the mount 48.")
+    ] = None,
+    mount: Annotated[
+        bool, typer.Option("--mount", help="A board on a wall, the vehicle turned by hand: for `mount`.")
+    ] = False,
     visits: Annotated[bool, typer.Option("--visits", help="The servo goes away and back before every pair.")] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Which twin rig.")] = 0,
     size: Annotated[str, typer.Option("--size", help="Image size, WIDTHxHEIGHT.")] = "640x480",
@@ -91,15 +97,28 @@ def render(
 ) -> None:
     """Render boards before the simulator's camera, as folders that `solve` takes."""
     from morpheyes_daemon.cli.progress import progress_line
-    from morpheyes_daemon.experiments.rendered_boards import DEFAULT_BOARD, render_folder
+    from morpheyes_daemon.experiments.rendered_boards import (
+        DEFAULT_BOARD,
+        DEFAULT_VIEWS,
+        MOUNT_VIEWS,
+        render_folder,
+        render_mount_folder,
+    )
     from morpheyes_daemon.simulation.rig_twin import RANGE_M
 
     usual = {"board": DEFAULT_BOARD.label, "square_mm": 25.0}
     chosen = choose_board(usual, board, square_mm, marker_mm, checked=False)
+    if mount:
+        with progress_line() as progress:
+            render_mount_folder(out, seed, views or MOUNT_VIEWS, chosen, _size(size), progress)
+        typer.echo(f"{views or MOUNT_VIEWS} pairs and attitudes: {out}; next: morpheyes calibrate mount FILE {out}")
+        return
     nominal_m = choose_baselines_m(baselines_mm, RANGE_M)
     with progress_line() as progress:
-        render_folder(out, seed, nominal_m, views, chosen, _size(size), visits, progress)
-    typer.echo(f"{len(nominal_m)} baselines, {views} pairs each: {out}; next: morpheyes calibrate solve {out}")
+        render_folder(out, seed, nominal_m, views or DEFAULT_VIEWS, chosen, _size(size), visits, progress)
+    typer.echo(
+        f"{len(nominal_m)} baselines, {views or DEFAULT_VIEWS} pairs each: {out}; next: morpheyes calibrate solve {out}"
+    )
 
 
 @app.command()
@@ -266,3 +285,4 @@ def _print_table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> No
 app.command()(capture)
 app.command()(check)
 app.command()(repeatability)
+app.command()(mount)

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from morpheyes_daemon.messages import Image
     from morpheyes_daemon.workshop.capture import Scene
 
+BASELINE_VIEWS, MOUNT_VIEWS = 12, 48
+
 BoardOption = Annotated[
     str | None, typer.Option("--board", help="Inner corners such as 9x6, or squares such as charuco:10x7:5X5_1000.")
 ]
@@ -29,7 +31,12 @@ def capture(
     out: Annotated[Path, typer.Argument(help="Folder for the pictures; goes on where it stopped.")],
     config: ConfigOption = None,
     baselines_mm: Annotated[str, typer.Option("--baselines", help="How many, or lengths such as 100,200.")] = "10",
-    views: Annotated[int, typer.Option("--views", min=3, max=200, help="Pairs per baseline.")] = 12,
+    views: Annotated[
+        int | None, typer.Option("--views", min=3, max=200, help="Pairs per baseline; default: 12, for the mount 48.")
+    ] = None,
+    mount: Annotated[
+        bool, typer.Option("--mount", help="The board stands, the vehicle is turned by hand: for `mount`.")
+    ] = False,
     visits: Annotated[
         int, typer.Option("--visits", min=0, max=100, help="For repeatability: so many visits with a standing board.")
     ] = 0,
@@ -38,7 +45,10 @@ def capture(
     marker_mm: MarkerOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Lead through all baselines with the rig's own camera and servo, keeping pictures that tell more."""
+    """Lead through all baselines with the rig's own camera and servo, keeping pictures that tell more.
+
+    With --mount the board stands still, and the vehicle, its autopilot on and its propellers off, is turned by hand.
+    """
     import asyncio
 
     from morpheyes_daemon.calibration.folder_solve import read_board_file
@@ -47,6 +57,7 @@ def capture(
     from morpheyes_daemon.devices.link import open_link
     from morpheyes_daemon.shipped import load_config
     from morpheyes_daemon.workshop.capture import capture_boards, capture_visits
+    from morpheyes_daemon.workshop.mount_capture import HandHeldVehicle, capture_mount
     from morpheyes_daemon.workshop.stand import RigStand
 
     vehicle = load_config(config)
@@ -56,16 +67,24 @@ def capture(
     nominal_m = [low_m] if low_m == high_m else choose_baselines_m(baselines_mm, (low_m, high_m))
 
     async def session() -> dict[str, int]:
-        async with RigStand.of(vehicle, running_clock(), open_link) as stand:
+        clock = running_clock()
+        async with RigStand.of(vehicle, clock, open_link) as stand:
+            if mount:
+                async with HandHeldVehicle(vehicle, clock, open_link) as held:
+                    kept = await capture_mount(
+                        stand, lambda: held.state, clock, out, chosen, views or MOUNT_VIEWS, _say
+                    )
+                return {out.name: kept}
             if visits:
                 return await capture_visits(stand, out, chosen, nominal_m, visits, _show)
-            return await capture_boards(stand, out, chosen, nominal_m, views, _show)
+            return await capture_boards(stand, out, chosen, nominal_m, views or BASELINE_VIEWS, _show)
 
     counts = asyncio.run(session())
     if as_json:
         typer.echo(json.dumps({"folder": str(out), "pairs": counts}, indent=2))
     else:
-        typer.echo(f"{sum(counts.values())} pairs are in {out}; next: morpheyes calibrate solve {out}")
+        following = f"mount FILE {out}" if mount else f"solve {out}"
+        typer.echo(f"{sum(counts.values())} pairs are in {out}; next: morpheyes calibrate {following}")
 
 
 def check(
@@ -210,6 +229,13 @@ def _print_check(result: CheckResult) -> None:
 def _map(counts: Any) -> str:
     """Coverage as text: rows one after the other, a dot where no corner was seen."""
     return "/".join("".join(".:*#"[min(int(count), 3)] for count in row) for row in counts)
+
+
+def _say(kept: int, text: str) -> None:
+    """One line that is written over."""
+    line = f"{kept} kept  {text}"
+    sys.stderr.write(f"\r\x1b[K{line}" if sys.stderr.isatty() else (f"{line}\n" if text == "kept" else ""))
+    sys.stderr.flush()
 
 
 def _show(scene: Scene) -> None:

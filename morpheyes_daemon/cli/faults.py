@@ -14,7 +14,7 @@ def command(
     seeds: Annotated[str, typer.Option(help="Seeds, one or a range such as 0-2.")] = "0-2",
     jobs: Annotated[int, typer.Option(min=1, help="Faults flown at the same time.")] = 2,
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "320x240",
-    calibration: Annotated[str, typer.Option(help="'solved', 'exact', or a calibration file.")] = "exact",
+    calibration: Annotated[str, typer.Option(help="'solved', 'mounted', 'exact', or a calibration file.")] = "exact",
     out: Annotated[Path | None, typer.Option(help="Also write the table here, as docs/faults.md.")] = None,
     resume: Annotated[
         Path | None, typer.Option(help="Keep each row in this file, and do not fly again what is in it.")

@@ -22,6 +22,7 @@ from morpheyes_daemon.experiments.flight import FlightPlan, Watchers, fly
 from morpheyes_daemon.experiments.flight_outputs import FlightOutputs
 from morpheyes_daemon.experiments.measures import measures_for
 from morpheyes_daemon.experiments.plan import hold, parse_baseline, with_seed
+from morpheyes_daemon.stereo.rig import RigModel
 
 Row = dict[str, Any]
 FLIGHTS = "flights.jsonl"
@@ -63,9 +64,16 @@ class Campaign:
             "latency_ms": stereo.latency_ms,
             "disparities_fraction": stereo.disparities_fraction,
             "wind_m_s": plan.scenario.wind_m_s,
+            "calibration": calibration_kind(plan.calibration),
             "seeds": [self.seeds[0], self.seeds[-1]],
             "baselines": list(self.baselines),
         }
+
+
+def calibration_kind(file: Path) -> str:
+    """Return how a calibration file came about: solved, mounted (the eyes' mount was measured as well) or exact."""
+    rig = RigModel.load(file)
+    return rig.method if rig.mount is None else "mounted"
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

@@ -98,12 +98,14 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def calibration_file(kind: str, progress: Progress = silent) -> Path:
-    """Return the calibration file to fly with: solved (made once and kept), exact, or a path."""
-    from morpheyes_daemon.experiments.solved_rig import solved_rig_file
+    """Return the calibration file to fly with: solved or mounted (made once and kept), exact, or a path."""
+    from morpheyes_daemon.experiments.solved_rig import mounted_rig_file, solved_rig_file
     from morpheyes_daemon.simulation.kept import cache_folder
 
     if kind == "solved":
         return solved_rig_file(0, progress=progress)
+    if kind == "mounted":
+        return mounted_rig_file(0, progress=progress)
     if kind == "exact":
         from morpheyes_daemon.simulation.rig_twin import RigTwin
 

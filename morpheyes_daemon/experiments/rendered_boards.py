@@ -17,16 +17,20 @@ import numpy as np
 import yaml
 
 from morpheyes_daemon.calibration.boards import Board, aligned, find_corners
+from morpheyes_daemon.calibration.mount import ATTITUDES, COLUMNS, MountViews, board_rotation
 from morpheyes_daemon.calibration.views import Observations, Progress, silent
 from morpheyes_daemon.config import ServoMotion
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages import RawPair
 from morpheyes_daemon.simulation.board_twin import BoardTwin
+from morpheyes_daemon.simulation.estimator import EstimatorNoise
 from morpheyes_daemon.simulation.rig_twin import RANGE_M, RigTwin
-from morpheyes_daemon.transforms import Array
+from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
+from morpheyes_daemon.transforms import Array, R_from_rpy, rpy_from_R
 
 DEFAULT_BOARD = Board(9, 6, 0.025)
 DEFAULT_VIEWS = 12
+MOUNT_VIEWS = 48
 DEFAULT_BASELINES_M = tuple(round(float(b), 4) for b in np.linspace(*RANGE_M, 10))
 """Ten equally spaced baselines (paper, section III-B), to a tenth of a millimetre as the folders name them."""
 _WORKERS = 2
@@ -82,6 +86,54 @@ def render_folder(
         progress("rendering boards", done, len(nominal_m) * views)
     content = {"board": board.label, "square_mm": board.square_m * 1e3, "rig": twin_name(seed, size)}
     (out / "board.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def render_mount_folder(
+    out: Path,
+    seed: int,
+    views: int = MOUNT_VIEWS,
+    board: Board = DEFAULT_BOARD,
+    size: tuple[int, int] = (640, 480),
+    progress: Progress = silent,
+) -> None:
+    """Write what `calibrate capture --mount` would: pictures of a board on a wall, and what the autopilot said.
+
+    Raises InputError when the folder is not empty.
+    """
+    _refuse_full(out)
+    out.mkdir(parents=True, exist_ok=True)
+    lines = [",".join(COLUMNS)]
+    for view, (pair, R_ned_frd) in enumerate(_hand_turned(RigTwin(*size, seed=seed), seed, views, board), start=1):
+        for eye, image in (("left", pair.left), ("right", pair.right)):
+            cv2.imwrite(str(out / f"{eye}{view:02d}.png"), image)
+        angles = (f"{np.degrees(angle):.4f}" for angle in rpy_from_R(R_ned_frd))
+        lines.append(f"left{view:02d}.png,{','.join(angles)}")
+        progress("rendering boards", view, views)
+    (out / ATTITUDES).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    content = {"board": board.label, "square_mm": board.square_m * 1e3, "rig": twin_name(seed, size)}
+    (out / "board.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def observe_mount(seed: int, cam0: CameraIntrinsics, progress: Progress = silent) -> MountViews:
+    """Return the views that `render_mount_folder` and `read_mount_folder` would give, without the files between."""
+    names, attitudes, boards = [], [], []
+    turned = _hand_turned(RigTwin(cam0.width, cam0.height, seed=seed), seed, MOUNT_VIEWS, DEFAULT_BOARD)
+    for view, (pair, R_ned_frd) in enumerate(turned, start=1):
+        seen = board_rotation(pair.left, DEFAULT_BOARD, cam0)
+        if seen is not None:
+            names.append(f"left{view:02d}.png")
+            attitudes.append(R_ned_frd)
+            boards.append(seen)
+        progress("measuring the eyes' mount", view, MOUNT_VIEWS)
+    return MountViews(tuple(names), np.array(attitudes), np.array(boards))
+
+
+def _hand_turned(twin: RigTwin, seed: int, views: int, board: Board) -> Iterator[tuple[RawPair, Array]]:
+    """Yield pairs at the smallest baseline, and attitudes R_ned_frd (3, 3) with the autopilot's errors."""
+    rng = np.random.default_rng([seed, 540])
+    for pair, R_ned_frd in BoardTwin(twin, board, seed).hand_turned(twin.actual_m(RANGE_M[0]), views):
+        error = EstimatorNoise().attitude_rad * rng.standard_normal(3)
+        yield pair, R_from_rpy(*(np.array(rpy_from_R(R_ned_frd)) + error).tolist())
 
 
 def observe_twin(

@@ -82,8 +82,13 @@ def _conditions(settings: Row) -> str:
     return (
         f"World `{settings['world']}`, {settings['image_size']}, {settings['rate_hz']:g} Hz with "
         f"{settings['latency_ms']:g} ms of latency, {_disparities(settings['disparities_fraction'])} disparities at "
-        f"{DISPARITIES_OF_PX} px, wind {settings['wind_m_s']:g} m/s:"
+        f"{DISPARITIES_OF_PX} px, wind {settings['wind_m_s']:g} m/s{_calibrated(settings)}:"
     )
+
+
+def _calibrated(settings: Row) -> str:
+    how = {"solved": "", "mounted": ", the eyes' mount measured as well", "exact": ", exact calibration"}
+    return how[settings.get("calibration", "solved")]
 
 
 def _command(settings: Row) -> str:
@@ -95,6 +100,8 @@ def _command(settings: Row) -> str:
     options += [f"--{key.replace('_', '-')} {settings[key]:g}" for key, value in usual.items() if settings[key] != value]
     if settings["disparities_fraction"] != StereoConfig().disparities_fraction:
         options.append(f"--disparities {_disparities(settings['disparities_fraction'])}")
+    if settings.get("calibration", "solved") != "solved":
+        options.append(f"--calibration {settings['calibration']}")
     return " ".join([f"morpheyes experiment {settings['mission']}", *options, f"--world {settings['world']}"])
 
 

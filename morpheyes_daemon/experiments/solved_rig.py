@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+from morpheyes_daemon.calibration.mount import solve_mount, ways_up
 from morpheyes_daemon.calibration.result import rig_model
 from morpheyes_daemon.calibration.solver import calibrate
 from morpheyes_daemon.calibration.views import Progress, silent
+from morpheyes_daemon.config import Mount
 from morpheyes_daemon.errors import CalibrationError
-from morpheyes_daemon.experiments.rendered_boards import DEFAULT_BOARD, observe_twin, twin_name
+from morpheyes_daemon.experiments.rendered_boards import DEFAULT_BOARD, observe_mount, observe_twin, twin_name
 from morpheyes_daemon.simulation.kept import cache_folder
+from morpheyes_daemon.simulation.rig_twin import T_frd_rig
 from morpheyes_daemon.stereo.rig import RigModel
 
 _SIZE = (640, 480)
 _VIEWS = 8
-_METHOD = 1
+_METHOD = _MOUNT_METHOD = 1
 """Raised whenever boards, detection or solver change, so that files made before are not used again."""
 
 
@@ -27,6 +31,17 @@ def solved_rig_file(seed: int, cache_dir: Path | None = None, progress: Progress
     path = folder / f"{twin_name(seed, _SIZE)}-v{_METHOD}.yaml"
     if not _readable(path):
         solve_twin(seed, progress).save(path)
+    return path
+
+
+def mounted_rig_file(seed: int, cache_dir: Path | None = None, progress: Progress = silent) -> Path:
+    """Return the same file with the mount of the left eye measured as well, made on the first call and kept."""
+    solved = solved_rig_file(seed, cache_dir, progress)
+    path = solved.with_name(f"{solved.stem}-mounted-v{_MOUNT_METHOD}.yaml")
+    if not _readable(path):
+        rig = RigModel.load(solved)
+        found = solve_mount(observe_mount(seed, rig.cam0, progress), T_frd_rig(Mount())[:3, :3], ways_up(DEFAULT_BOARD))
+        replace(rig, mount=found.mount).save(path)
     return path
 
 

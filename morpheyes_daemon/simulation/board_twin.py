@@ -22,7 +22,7 @@ from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.renderer import Rendered, Renderer
 from morpheyes_daemon.simulation.rig_twin import RigTwin, T_frd_rig
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
-from morpheyes_daemon.transforms import Array, R_from_rotvec, inverse, pose
+from morpheyes_daemon.transforms import R_FRD_CAM, Array, R_from_rotvec, inverse, pose
 
 _INK, _PAPER = 0.03, 0.62
 """Reflectance of black and white; white stays clear of the sensor's limit."""
@@ -33,6 +33,8 @@ _MARGIN_PX = 6.0
 _NEAREST_FILL = 0.92
 """The nearest board spans this share of what both eyes see, the farthest one still has squares that can be found."""
 _TILT_RAD = 0.6
+_ROLL_RAD, _HAND_ROLL_RAD = 0.2, 0.7
+"""One sigma about the line of sight: of a board that is held upright, and of a vehicle that is turned onto its sides."""
 _GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
 
@@ -123,8 +125,20 @@ class BoardTwin:
 
     def pairs(self, baselines_true_m: Sequence[float]) -> Iterator[RawPair]:
         """Yield raw pairs (BGR) of the board at drawn poses, one for each true baseline (all about the same)."""
-        rng = np.random.default_rng([self._seed, 510, round(baselines_true_m[0] * 1e9)])
-        poses = draw_poses(self._rig, self._board, max(baselines_true_m), len(baselines_true_m), rng)
+        yield from self._before_the_bar(self._poses(baselines_true_m, 510), baselines_true_m)
+
+    def hand_turned(self, baseline_true_m: float, views: int) -> Iterator[tuple[RawPair, Array]]:
+        """Yield raw pairs (BGR) of a board on a wall and the true R_ned_frd (3, 3) of the vehicle held before it."""
+        poses = self._poses([baseline_true_m] * views, 530, _HAND_ROLL_RAD)
+        attitudes = [R_FRD_CAM @ (T_frd_rig(self._mount) @ T)[:3, :3].T for T in poses]
+        yield from zip(self._before_the_bar(poses, [baseline_true_m] * views), attitudes, strict=True)
+
+    def _poses(self, baselines_true_m: Sequence[float], stream: int, roll_rad: float = _ROLL_RAD) -> list[Array]:
+        rng = np.random.default_rng([self._seed, stream, round(baselines_true_m[0] * 1e9)])
+        return draw_poses(self._rig, self._board, max(baselines_true_m), len(baselines_true_m), rng, roll_rad)
+
+    def _before_the_bar(self, poses: Sequence[Array], baselines_true_m: Sequence[float]) -> Iterator[RawPair]:
+        """Yield raw pairs of the board at T_rig_board (4, 4)."""
         first = len(self._scene.T_ned_board)
         self._scene.T_ned_board += [T_frd_rig(self._mount) @ T for T in poses]
         for view, true_m in enumerate(baselines_true_m):
@@ -133,7 +147,12 @@ class BoardTwin:
 
 
 def draw_poses(
-    rig: RigTwin, board: FlatBoard, baseline_true_m: float, views: int, rng: np.random.Generator
+    rig: RigTwin,
+    board: FlatBoard,
+    baseline_true_m: float,
+    views: int,
+    rng: np.random.Generator,
+    roll_rad: float = _ROLL_RAD,
 ) -> list[Array]:
     """Return T_rig_board (4, 4) of poses at which both eyes see the whole board.
 
@@ -147,7 +166,7 @@ def draw_poses(
     drawn: list[Array] = []
     for place, slot in enumerate(rng.permutation(views)):
         inverse_z = 1.0 / far + (slot + 0.5) / views * (1.0 / near - 1.0 / far)
-        R = _tilt(rng)
+        R = _tilt(rng, roll_rad)
         angle = turn + _GOLDEN_RAD * place
         share = 1.0 if place % 2 == 0 else float(rng.uniform(0.0, 1.0))
         centre = _centre(eyes, points @ R.T, 1.0 / inverse_z, angle, share)
@@ -155,9 +174,9 @@ def draw_poses(
     return drawn
 
 
-def _tilt(rng: np.random.Generator) -> Array:
+def _tilt(rng: np.random.Generator, roll_rad: float) -> Array:
     about = rng.uniform(-_TILT_RAD, _TILT_RAD, 2)
-    return R_from_rotvec(np.array([*about, 0.0])) @ R_from_rotvec(np.array([0.0, 0.0, rng.normal(0, 0.2)]))
+    return R_from_rotvec(np.array([*about, 0.0])) @ R_from_rotvec(np.array([0.0, 0.0, rng.normal(0, roll_rad)]))
 
 
 def _centre(eyes: list[tuple[CameraIntrinsics, Array]], points: Array, z: float, angle: float, share: float) -> Array:

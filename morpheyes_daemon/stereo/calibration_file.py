@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from morpheyes_daemon.errors import CalibrationError, ConfigError
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
-from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
+from morpheyes_daemon.stereo.rig import CalibratedBaseline, EyeMount, RigModel
 from morpheyes_daemon.yaml_source import parse_yaml, read_text, validate
 
 FORMAT = "morpheyes-calibration-1"
@@ -29,6 +29,7 @@ _HEADER = """\
 # T_cam0_cam1 takes points from the right camera's frame to the left one's (x right, y down, z forward).
 # Each pose belongs to a nominal baseline, what the servo is told; the true length is that of the translation.
 # Distortion is in the paper's order: radial k1, k2, k5, tangential k3, k4.
+# `mount` is the rotation vector of the left eye on the bar, where `morpheyes calibrate mount` has measured it.
 # sha256 covers every value here: do not edit, calibrate again instead.
 """
 _REMEDY = "fetch it from a copy, or make it again with `morpheyes calibrate solve`"
@@ -65,6 +66,11 @@ class _Baseline(_Part):
     sigma_yaw_deg: float | None = None
 
 
+class _Mount(_Part):
+    rotation_deg: tuple[float, float, float]
+    sigma_deg: tuple[float, float, float]
+
+
 class _Cameras(_Part):
     cam0: _Camera
     cam1: _Camera
@@ -75,6 +81,7 @@ class _File(_Part):
     method: Literal["solved", "exact"]
     cameras: _Cameras
     baselines: list[_Baseline] = Field(min_length=1)
+    mount: _Mount | None = None
     details: dict[str, Any]
     sha256: str
 
@@ -116,6 +123,7 @@ def document(rig: RigModel) -> dict[str, Any]:
         "method": rig.method,
         "cameras": {"cam0": _camera_part(rig.cam0), "cam1": _camera_part(rig.cam1)},
         "baselines": [_baseline_part(baseline) for baseline in rig.baselines],
+        **({} if rig.mount is None else {"mount": _mount_part(rig.mount)}),
         "details": _plain(rig.details),
     }
 
@@ -145,7 +153,12 @@ def _rig(file: _File) -> RigModel:
         baselines=tuple(_baseline(part) for part in file.baselines),
         method=file.method,
         details=file.details,
+        mount=None if file.mount is None else _eye_mount(file.mount),
     )
+
+
+def _eye_mount(part: _Mount) -> EyeMount:
+    return EyeMount(_radians(part.rotation_deg), _radians(part.sigma_deg))
 
 
 def _intrinsics(part: _Camera) -> CameraIntrinsics:
@@ -191,6 +204,18 @@ def _baseline_part(baseline: CalibratedBaseline) -> dict[str, Any]:
         "sigma_yaw_deg": None if yaw is None else _digits(math.degrees(yaw)),
     }
     return {key: value for key, value in part.items() if value is not None}
+
+
+def _mount_part(mount: EyeMount) -> dict[str, Any]:
+    return {
+        "rotation_deg": [_digits(math.degrees(angle)) for angle in mount.rotation_rad],
+        "sigma_deg": [_digits(math.degrees(angle)) for angle in mount.sigma_rad],
+    }
+
+
+def _radians(degrees: tuple[float, float, float]) -> tuple[float, float, float]:
+    x, y, z = (math.radians(angle) for angle in degrees)
+    return x, y, z
 
 
 def _digits(value: float) -> float:

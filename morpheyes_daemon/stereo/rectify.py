@@ -110,7 +110,7 @@ def rectify(rig: RigModel, baseline_m: float) -> Rectification:
     R_rect_cam1 = R_rect_cam0 @ T_cam0_cam1[:3, :3]
     pinhole = common_pinhole(rig, R_rect_cam0, R_rect_cam1)
     length_m = float(np.linalg.norm(T_cam0_cam1[:3, 3]))
-    T_rig_cam0 = pose(np.eye(3), np.array([-length_m / 2, 0.0, 0.0]))
+    T_rig_cam0 = pose(rig.R_rig_cam0, np.array([-length_m / 2, 0.0, 0.0]))
     return Rectification(
         nominal_m=baseline_m,
         baseline_m=length_m,

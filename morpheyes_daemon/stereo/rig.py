@@ -21,9 +21,9 @@ import numpy as np
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.screw import dual_quaternion, pose_from_dual_quaternion, sclerp
-from morpheyes_daemon.transforms import Array, q_from_R
+from morpheyes_daemon.transforms import Array, R_from_rotvec, q_from_R
 
-__all__ = ["CalibratedBaseline", "CameraIntrinsics", "RigModel"]
+__all__ = ["CalibratedBaseline", "CameraIntrinsics", "EyeMount", "RigModel"]
 
 RANGE_TOLERANCE_M = 1.5e-3
 """How far outside the calibrated range a baseline is still served: two servos' backlash and the play at the stops."""
@@ -60,10 +60,19 @@ class CalibratedBaseline:
 
 
 @dataclass(frozen=True)
+class EyeMount:
+    """How the left eye is turned on the bar: rotation vector R_rig_cam0 and one sigma of it, radians, camera axes."""
+
+    rotation_rad: tuple[float, float, float]
+    sigma_rad: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
 class RigModel:
     """Intrinsics of both eyes and the pose between them over the calibrated range of baselines.
 
-    `method` is "solved" (from images) or "exact" (known, a simulator's truth). `details` is plain data for people
+    `method` is "solved" (from images) or "exact" (known, a simulator's truth). Boards do not tell how the eyes sit on
+    the vehicle: without a `mount` the left one is taken for straight on the bar. `details` is plain data for people
     and reports: board, date, coverage, uncertainty per parameter; it is kept in the file and not used for geometry.
     """
 
@@ -72,6 +81,7 @@ class RigModel:
     baselines: tuple[CalibratedBaseline, ...]
     method: str = "solved"
     details: Mapping[str, Any] = field(default_factory=dict)
+    mount: EyeMount | None = None
 
     def __post_init__(self) -> None:
         nominal = [baseline.nominal_m for baseline in self.baselines]
@@ -85,6 +95,8 @@ class RigModel:
             raise CalibrationError(f"The calibration method {self.method!r} is none of {', '.join(METHODS)}.")
         for baseline in self.baselines:
             _check(baseline)
+        if self.mount is not None and not np.all(np.isfinite([*self.mount.rotation_rad, *self.mount.sigma_rad])):
+            raise CalibrationError("The left eye's rotation on the bar is not finite.")
 
     @classmethod
     def from_poses(
@@ -135,6 +147,11 @@ class RigModel:
     def range_m(self) -> tuple[float, float]:
         """The nominal baselines that are covered, smallest and largest."""
         return self.baselines_m[0], self.baselines_m[-1]
+
+    @property
+    def R_rig_cam0(self) -> Array:
+        """The left eye's rotation (3, 3) on the bar; none where it was not measured."""
+        return np.eye(3) if self.mount is None else R_from_rotvec(np.array(self.mount.rotation_rad))
 
     def T_cam0_cam1(self, baseline_m: float) -> Array:
         """Return the pose (4, 4) of the right eye in the left at a nominal baseline; see `dual_quaternion`."""

@@ -90,7 +90,7 @@ async def _one_baseline(
         hint = guide.consider(pair.left, pair.right)
         if hint.kept:
             number += 1
-            _write(folder, number, pair)
+            write_pair(folder, number, pair)
         show(Scene(nominal_m, guide, hint))
     return number
 
@@ -106,11 +106,12 @@ async def _one_visit(stand: RigStand, folder: Path, board: Board, nominal_m: flo
         hint = guide.consider(again.left, again.right)
         show(Scene(nominal_m, guide, hint))
         if hint.kept:
-            _write(folder, number + 1, again)
+            write_pair(folder, number + 1, again)
             return number + 1
 
 
-def _write(folder: Path, number: int, pair: RawPair) -> None:
+def write_pair(folder: Path, number: int, pair: RawPair) -> None:
+    """Write a pair as left and right pictures of a number, each whole or not at all."""
     try:
         folder.mkdir(exist_ok=True)
         for eye, image in (("left", pair.left), ("right", pair.right)):

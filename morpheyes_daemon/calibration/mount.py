@@ -1,0 +1,182 @@
+"""How the left eye is turned on the vehicle, from a board that stands still before a vehicle that is turned by hand.
+
+Boards alone tell the eyes from each other; where they point on the body decides where an opening is believed to be.
+The autopilot's attitude and the board's pose in the left eye turn together, and what lies between them is the eye's
+rotation on the body (rotation part of robot-world hand-eye calibration, A X B = Y; Shah 2013). No position is used.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from morpheyes_daemon.calibration.boards import Board, find_corners
+from morpheyes_daemon.calibration.views import Progress, silent
+from morpheyes_daemon.errors import CalibrationError, InputError
+from morpheyes_daemon.messages import Image
+from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
+from morpheyes_daemon.stereo.rig import EyeMount
+from morpheyes_daemon.transforms import Array, R_from_rotvec, R_from_rpy, rotvec_from_R
+
+ATTITUDES = "attitudes.csv"
+COLUMNS = ("picture", "roll_deg", "pitch_deg", "yaw_deg")
+
+FEWEST_VIEWS = 10
+WORST_SIGMA_RAD = 4e-3
+"""One sigma of a rotation that is no better than a careful builder's eye."""
+
+_ROUNDS = 20
+_STRAY = 3.0
+"""A view whose rotations disagree by so many times the median counts less and less."""
+
+_CORNERS_FEWEST = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MountViews:
+    """The vehicle's attitudes R_ned_frd (n, 3, 3) and the board in the left eye, R_cam0_board (n, 3, 3)."""
+
+    names: tuple[str, ...]
+    R_ned_frd: Array
+    R_cam0_board: Array
+    problems: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MountSolution:
+    """The left eye's rotation on the bar; `rms_rad` is what is left between attitude and board in a view."""
+
+    mount: EyeMount
+    rms_rad: float
+    turned_rad: float
+    """How far the vehicle was turned, root mean square about each view's own mean."""
+
+
+def solve_mount(views: MountViews, R_frd_rig: Array, turns: int) -> MountSolution:
+    """Return the rotation of the left eye on a bar that sits on the body as `R_frd_rig` (3, 3) says.
+
+    `turns` is the board's `ways_up`. Gauss-Newton on rotation vectors with Huber's weights. Raises CalibrationError
+    when views are too few or the vehicle was hardly turned.
+    """
+    if len(views.names) < FEWEST_VIEWS:
+        raise CalibrationError(
+            f"{len(views.names)} pictures show the board, {FEWEST_VIEWS} are needed: take more, from all sides."
+        )
+    A = views.R_ned_frd @ R_frd_rig
+    B = _same_way_up(A, views.R_cam0_board, turns)
+    X, Y = np.eye(3), A[0] @ B[0]
+    J = np.concatenate([B.transpose(0, 2, 1), np.broadcast_to(-np.eye(3), B.shape)], axis=2).reshape(-1, 6)
+    for _ in range(_ROUNDS):
+        off = _off(A, X, B, Y)
+        weight = np.repeat(np.sqrt(_huber(np.linalg.norm(off, axis=1))), 3)
+        step = np.linalg.lstsq(J * weight[:, None], -off.ravel() * weight, rcond=None)[0]
+        X, Y = X @ R_from_rotvec(step[:3]), Y @ R_from_rotvec(step[3:])
+        if np.abs(step).max() < 1e-10:
+            break
+    rms = math.sqrt(float(((off.ravel() * weight) ** 2).sum() / ((weight**2).sum() - 6)))
+    information = (J * weight[:, None]).T @ (J * weight[:, None])
+    sigma = rms * np.sqrt(np.diag(np.linalg.inv(information))[:3])
+    turned = _turned_rad(A)
+    if sigma.max() > WORST_SIGMA_RAD:
+        raise CalibrationError(
+            f"The eye's rotation is only known to {math.degrees(float(sigma.max())):.2f} degrees: turn the vehicle "
+            f"farther (these pictures: {math.degrees(turned):.0f} degrees) about all three axes, and hold it still."
+        )
+    x = rotvec_from_R(X)
+    mount = EyeMount((float(x[0]), float(x[1]), float(x[2])), (float(sigma[0]), float(sigma[1]), float(sigma[2])))
+    return MountSolution(mount, rms, turned)
+
+
+def read_mount_folder(folder: Path, board: Board, cam0: CameraIntrinsics, progress: Progress = silent) -> MountViews:
+    """Return the views of a folder that holds left pictures and `attitudes.csv`.
+
+    What cannot be used is named and left out. Raises InputError when there is no such file or a row is not
+    understood.
+    """
+    names, attitudes, boards, problems = [], [], [], []
+    rows = list(attitude_rows(folder / ATTITUDES))
+    for done, (name, attitude) in enumerate(rows, start=1):
+        image = cv2.imread(str(folder / name), cv2.IMREAD_COLOR)
+        if image is None:
+            problems.append(f"{folder / name}: is not a readable picture; copy it again or take out its row.")
+        elif (seen := board_rotation(np.asarray(image, np.uint8), board, cam0)) is None:
+            problems.append(f"{folder / name}: shows no whole board and is left out.")
+        else:
+            names.append(name)
+            attitudes.append(attitude)
+            boards.append(seen)
+        progress("looking for the board", done, len(rows))
+    R_ned_frd, R_cam0_board = (np.array(part, np.float64).reshape(-1, 3, 3) for part in (attitudes, boards))
+    return MountViews(tuple(names), R_ned_frd, R_cam0_board, tuple(problems))
+
+
+def board_rotation(image: Image, board: Board, cam0: CameraIntrinsics) -> Array | None:
+    """Return R_cam0_board (3, 3) of the board in a picture of the left eye, None when it is not seen."""
+    corners = find_corners(image, board)
+    if corners is None:
+        return None
+    height, width = image.shape[:2]
+    normalised = cam0.rescaled(width, height).normalised_from_pixels(corners)
+    seen = np.isfinite(normalised).all(axis=1)
+    if seen.sum() < _CORNERS_FEWEST:
+        return None
+    found, rotation, _ = cv2.solvePnP(board.points_m[seen], normalised[seen], np.eye(3), None)
+    return R_from_rotvec(np.asarray(rotation, np.float64).ravel()) if found else None
+
+
+def ways_up(board: Board) -> int:
+    """Return in how many ways up a board looks the same."""
+    if board.kind == "charuco":
+        return 1
+    return 4 if board.rows == board.columns else 2
+
+
+def attitude_rows(path: Path) -> Iterator[tuple[str, Array]]:
+    """Yield picture and R_ned_frd (3, 3) of every line of `attitudes.csv`; raises InputError naming the line."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        raise InputError(
+            f"{path}: cannot be read; take the pictures with `morpheyes calibrate capture --mount`."
+        ) from None
+    reader = csv.DictReader(lines)
+    if reader.fieldnames is None or not set(COLUMNS) <= set(reader.fieldnames):
+        raise InputError(f"{path}: needs the columns {', '.join(COLUMNS)}.")
+    for number, row in enumerate(reader, start=2):
+        try:
+            angles = [math.radians(float(row[column])) for column in COLUMNS[1:]]
+        except (TypeError, ValueError):
+            angles = [math.nan]
+        if not all(math.isfinite(angle) for angle in angles):
+            raise InputError(f"{path}, line {number}: the angles are no numbers; correct the line or take it out.")
+        yield str(row["picture"]), R_from_rpy(*angles)
+
+
+def _same_way_up(A: Array, B: Array, turns: int) -> Array:
+    """Return the board's rotations as of one and the same corner: it looks alike when turned about its normal."""
+    about = [R_from_rotvec(np.array([0.0, 0.0, 2 * math.pi * k / turns])) for k in range(turns)]
+    ways = B[:, None] @ np.array(about)
+    likeness = np.einsum("ij,nkij->nk", A[0] @ B[0], A[:, None] @ ways)
+    return np.asarray(ways[np.arange(len(B)), likeness.argmax(axis=1)])
+
+
+def _off(A: Array, X: Array, B: Array, Y: Array) -> Array:
+    """Return what is missing (n, 3) in A X B = Y, as rotation vectors in the board's axes."""
+    return np.array([rotvec_from_R(R) for R in Y.T @ A @ X @ B])
+
+
+def _huber(off: Array) -> Array:
+    limit = _STRAY * max(float(np.median(off)), 1e-9)
+    return np.asarray(np.minimum(1.0, limit / np.maximum(off, 1e-12)))
+
+
+def _turned_rad(A: Array) -> float:
+    """Return the root mean square angle of the attitudes about the first, over their mean."""
+    vectors = np.array([rotvec_from_R(A[0].T @ R) for R in A])
+    return math.sqrt(float(((vectors - vectors.mean(axis=0)) ** 2).sum(axis=1).mean()))

@@ -1,0 +1,79 @@
+"""`morpheyes calibrate mount`: where the eyes point on the vehicle, from pictures and attitudes."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from morpheyes_daemon.cli.calibrate_live import BoardOption, ConfigOption, JsonOption, MarkerOption, SquareOption
+
+if TYPE_CHECKING:
+    from morpheyes_daemon.calibration.mount import MountSolution, MountViews
+
+
+def mount(
+    file: Annotated[Path, typer.Argument(help="Calibration file, from `solve`.")],
+    folder: Annotated[Path, typer.Argument(help="Pictures and attitudes.csv, from `capture --mount`.")],
+    out: Annotated[Path | None, typer.Option("--out", help="File to write; default: the calibration file.")] = None,
+    config: ConfigOption = None,
+    board: BoardOption = None,
+    square_mm: SquareOption = None,
+    marker_mm: MarkerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure how the left eye is turned on the vehicle, and write it into the calibration file.
+
+    Half a degree that nobody knows of is 35 mm aside at 4 m: it decides whether a gap is met in its middle.
+    """
+    from dataclasses import replace
+
+    from morpheyes_daemon.calibration.folder_solve import read_board_file
+    from morpheyes_daemon.calibration.mount import read_mount_folder, solve_mount, ways_up
+    from morpheyes_daemon.cli.calibrate import choose_board
+    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.perception import build_craft
+    from morpheyes_daemon.shipped import load_config
+    from morpheyes_daemon.stereo.rig import RigModel
+
+    rig = RigModel.load(file)
+    known = read_board_file(folder) if folder.is_dir() else {}
+    chosen = choose_board(known, board, square_mm, marker_mm, ask=not as_json and sys.stdin.isatty())
+    R_frd_rig = build_craft(load_config(config)).T_frd_rig[:3, :3]
+    with progress_line() as progress:
+        views = read_mount_folder(folder, chosen, rig.cam0, progress)
+    found = solve_mount(views, R_frd_rig, ways_up(chosen))
+    written = out or file
+    replace(rig, mount=found.mount).save(written)
+    if as_json:
+        typer.echo(json.dumps({**_figures(found, views), "file": str(written)}, indent=2))
+    else:
+        _print(found, views, written)
+
+
+def _figures(found: MountSolution, views: MountViews) -> dict[str, object]:
+    return {
+        "views": len(views.names),
+        "rotation_deg": [round(math.degrees(angle), 4) for angle in found.mount.rotation_rad],
+        "sigma_deg": [round(math.degrees(angle), 4) for angle in found.mount.sigma_rad],
+        "rms_deg": round(math.degrees(found.rms_rad), 4),
+        "turned_deg": round(math.degrees(found.turned_rad), 1),
+        "problems": list(views.problems),
+    }
+
+
+def _print(found: MountSolution, views: MountViews, written: Path) -> None:
+    names = ("up", "right", "clockwise")
+    for name, angle, sigma in zip(names, found.mount.rotation_rad, found.mount.sigma_rad, strict=True):
+        typer.echo(f"the left eye is turned {name} by {math.degrees(angle):+.2f} ± {math.degrees(sigma):.2f} degrees")
+    typer.echo(
+        f"from {len(views.names)} pictures, vehicle turned by {math.degrees(found.turned_rad):.0f} degrees; attitude "
+        f"and board differ by {math.degrees(found.rms_rad):.2f} degrees in a picture"
+    )
+    for problem in views.problems:
+        typer.echo(f"left out: {problem}", err=True)
+    typer.echo(f"written: {written}")
