@@ -11,6 +11,8 @@ import yaml
 
 from morpheyes_daemon.cli import main
 from morpheyes_daemon.experiments.rendered_boards import render_folder
+from morpheyes_daemon.simulation.rig_twin import RigTwin
+from morpheyes_daemon.stereo.rig import RigModel
 
 NOMINAL_M = (0.1, 0.2, 0.3)
 
@@ -152,3 +154,28 @@ def test_the_same_seed_renders_the_same_pictures(boards: Path, tmp_path: Path) -
     render_folder(tmp_path / "third", 0, (0.2,), views=2)
     one, two = (cv2.imread(str(tmp_path / name / "200mm" / "left01.png")) for name in ("again", "third"))
     assert np.array_equal(one, two)
+
+
+def test_the_eyes_mount_is_measured_and_written_into_the_file(tmp_path: Path, terminal: Terminal) -> None:
+    file, held = tmp_path / "rig.yaml", tmp_path / "held"
+    RigTwin(640, 480, seed=0).exact_rig(3).save(file)
+    assert terminal("render", held, "--mount", "--views", 20)[0] == 0
+    code, out, _ = terminal("mount", file, held, "--out", tmp_path / "mounted.yaml", "--json")
+    found = json.loads(out)
+    assert code == 0
+    # the twin's left eye is turned by -0.52, 0.32 and 0.08 degrees
+    assert found["rotation_deg"] == pytest.approx([-0.52, 0.32, 0.08], abs=0.25)
+    assert max(found["sigma_deg"]) < 0.15
+    assert RigModel.load(tmp_path / "mounted.yaml").mount is not None
+    assert RigModel.load(file).mount is None
+    code, out, _ = terminal("mount", file, held)
+    assert "the left eye is turned up by -0." in out
+    assert RigModel.load(file).mount is not None
+
+
+def test_without_attitudes_it_says_what_to_do(boards: Path, tmp_path: Path, terminal: Terminal) -> None:
+    file = tmp_path / "rig.yaml"
+    RigTwin(640, 480, seed=0).exact_rig(3).save(file)
+    code, _, err = terminal("mount", file, boards)
+    assert code != 0
+    assert "calibrate capture --mount" in err
