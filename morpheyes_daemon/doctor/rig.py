@@ -42,7 +42,7 @@ def examine_calibration(config: VehicleConfig) -> tuple[list[Finding], RigModel 
             rig.T_cam0_cam1(baseline_m)
     except (CalibrationError, ConfigError) as error:
         return [_unusable(str(error))], None
-    return [*_calibration_verdict(rig, config), *_sync(rig, config)], rig
+    return [*_calibration_verdict(rig, config), *_mount(rig, config), *_sync(rig, config)], rig
 
 
 def _unusable(evidence: str) -> Finding:
@@ -69,6 +69,20 @@ def _calibration_verdict(rig: RigModel, config: VehicleConfig) -> list[Finding]:
             f"{config.calibration}: {words}",
             "depth is wrong by more than the daemon reckons with",
             "take new images as `morpheyes calibrate report` advises and solve again",
+        )
+    ]
+
+
+def _mount(rig: RigModel, config: VehicleConfig) -> list[Finding]:
+    if rig.mount is not None or config.camera.backend in ("sim", "recording"):
+        return []
+    return [
+        Finding(
+            "mount-unmeasured",
+            Severity.NOTE,
+            f"{config.calibration}: says nothing of where the eyes point on the vehicle",
+            "half a degree is 35 mm aside at 4 m, as much as the vehicle has to spare in a gap",
+            "measure it with `morpheyes calibrate capture --mount` and `morpheyes calibrate mount`",
         )
     ]
 

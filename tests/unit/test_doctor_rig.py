@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import namedtuple
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from morpheyes_daemon.doctor.rig import examine_calibration, examine_camera, exa
 from morpheyes_daemon.errors import DeviceNotFoundError, DeviceTimeoutError
 from morpheyes_daemon.messages import Image, RawPair
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
-from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.stereo.rig import EyeMount, RigModel
 
 WIDTH, HEIGHT, F_PX, BASELINE_M, DISPARITY_PX = 320, 240, 300.0, 0.1, 12
 
@@ -178,6 +179,17 @@ def test_exact_calibration_is_not_a_real_rig(tmp_path: Path) -> None:
     camera = V4l2CameraConfig(backend="v4l2", width_px=WIDTH, height_px=HEIGHT)
     settings = config(tmp_path, calibration=saved(tmp_path, rig(method="exact", verdict="")), camera=camera)
     assert examine_calibration(settings)[0][0].severity is Severity.STOP
+
+
+def test_a_mount_that_was_never_measured_is_noted(tmp_path: Path) -> None:
+    camera = V4l2CameraConfig(backend="v4l2", width_px=WIDTH, height_px=HEIGHT, sync_error_ms=0.0)
+    settings = config(tmp_path, calibration=saved(tmp_path, rig()), camera=camera)
+    [finding] = examine_calibration(settings)[0]
+    assert (finding.id, finding.severity) == ("mount-unmeasured", Severity.NOTE)
+    assert "calibrate mount" in finding.remedy
+    mounted = replace(rig(), mount=EyeMount((0.0, 0.01, 0.0), (1e-3, 1e-3, 1e-3)))
+    settings = config(tmp_path, calibration=saved(tmp_path, mounted), camera=camera)
+    assert examine_calibration(settings)[0] == []
 
 
 def test_eyes_far_from_synchronous(tmp_path: Path) -> None:
