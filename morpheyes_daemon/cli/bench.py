@@ -39,21 +39,24 @@ def sticks(
 ) -> None:
     """Measure the time between stick messages in real time under full vision load.
 
-    Exit code 1 when p99 is above 25 ms or any interval above 100 ms.
+    Exit code 1 when p99 is above 25 ms or any interval above 100 ms. On a virtual machine the host may take the
+    processor away; intervals in which it took none are listed apart.
     """
     from morpheyes_daemon.experiments.bench_realtime import bench_sticks
 
     plan = _plan(size, calibration, rate_hz, minutes)
     found = _live(as_json, lambda show: bench_sticks(plan, minutes, show))
+    beat = found.beat
     rows = [
-        ("stick messages", f"{found.intervals} in {found.minutes:g} minutes, {found.frames} frames seen"),
-        ("interval", _beat(found.p50_s, found.p99_s, found.max_s)),
+        ("stick messages", f"{beat.count} in {found.minutes:g} minutes, {found.frames} frames seen"),
+        ("interval", _beat(beat.p50_s, beat.p99_s, beat.max_s)),
         ("loop lateness", f"{found.worst_lateness_ms:.1f} ms at worst"),
-        ("taken by the host", f"{found.stolen_s:.1f} s of processor time, of a virtual machine"),
+        ("taken by the host", f"{found.stolen_s:.1f} s of processor time, on a virtual machine"),
+        ("while it took none", f"{beat.own_count}: p99 {_ms(beat.own_p99_s)}, largest {_ms(beat.own_max_s)}"),
         ("at the end", found.final_state),
     ]
     say(asdict(found), rows, as_json)
-    if found.p99_s > LIMIT_P99_S or found.max_s > LIMIT_MAX_S:
+    if beat.p99_s > LIMIT_P99_S or beat.max_s > LIMIT_MAX_S:
         raise typer.Exit(1)
 
 
@@ -193,4 +196,8 @@ def _hand(times: dict[str, float]) -> str:
 
 
 def _beat(p50_s: float, p99_s: float, max_s: float) -> str:
-    return f"{p50_s * 1e3:.1f} ms median, p99 {p99_s * 1e3:.1f} ms, largest {max_s * 1e3:.1f} ms"
+    return f"{_ms(p50_s)} median, p99 {_ms(p99_s)}, largest {_ms(max_s)}"
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1e3:.1f} ms"

@@ -20,6 +20,7 @@ from morpheyes_daemon.clock import S, running_clock
 from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.experiments.flight import FlightPlan, Progress
 from morpheyes_daemon.experiments.realtime import RealtimeFlight, realtime_daemon
+from morpheyes_daemon.experiments.stick_beat import StickIntervals, stolen_s
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.service import real_time_runner
 
@@ -37,15 +38,11 @@ Show = Callable[[Progress], None]
 class StickBench:
     """Seconds between stick messages over `minutes`; `frames` tells the load.
 
-    `stolen_s` is the processor time that the host of a virtual machine gave to others meanwhile: beats that are late
-    for it are none of ours.
+    `stolen_s` is the processor time that the host of a virtual machine gave to others meanwhile.
     """
 
     minutes: float
-    intervals: int
-    p50_s: float
-    p99_s: float
-    max_s: float
+    beat: StickIntervals
     frames: int
     worst_lateness_ms: float
     stolen_s: float
@@ -100,14 +97,10 @@ async def _sticks(plan: FlightPlan, minutes: float, show: Show, folder: Path) ->
         await _engaged(flight)
         stolen_before_s = stolen_s()
         await _live(flight, minutes * 60.0)
-        beat = flight.beat.intervals()
         health = flight.daemon.topics.health.get()
         return StickBench(
             minutes=minutes,
-            intervals=beat.count,
-            p50_s=beat.p50_s,
-            p99_s=beat.p99_s,
-            max_s=beat.max_s,
+            beat=flight.beat.intervals(),
             frames=flight.tally.frames,
             worst_lateness_ms=health.worst_lateness_ms if health is not None else 0.0,
             stolen_s=stolen_s() - stolen_before_s,
@@ -169,11 +162,6 @@ def resident_mb(pid: int) -> float:
     """Return the memory that a process really holds."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-def stolen_s() -> float:
-    """Return the processor time that the machine's host gave to others since boot (`steal` of /proc/stat)."""
-    return int(Path("/proc/stat").read_text().split(maxsplit=9)[8]) / os.sysconf("SC_CLK_TCK")
 
 
 async def _engaged(flight: RealtimeFlight) -> None:

@@ -12,7 +12,7 @@ from morpheyes_daemon.safety.states import Action, State
 
 def beat_of(*outputs: tuple[int, Action]) -> StickBeat:
     gate: Latest[GateOutput] = Latest("gate")
-    beat = StickBeat(gate)
+    beat = StickBeat(gate, lambda: 0.0)
     for t_ms, action in outputs:
         gate.publish(GateOutput(t_ms * MS, State.ENGAGED, action, None))
     return beat
@@ -26,6 +26,17 @@ def test_only_what_moves_or_holds_a_stick_counts() -> None:
     assert found.count == 3
     assert found.max_s == pytest.approx(0.090)
     assert found.p50_s == pytest.approx(0.020)
+
+
+def test_what_the_machines_host_took_is_told_apart() -> None:
+    gate: Latest[GateOutput] = Latest("gate")
+    stolen = iter([0.0, 0.0, 0.3, 0.3, 0.31])
+    beat = StickBeat(gate, lambda: next(stolen))
+    for t_ms in (0, 20, 350, 372, 392):
+        gate.publish(GateOutput(t_ms * MS, State.ENGAGED, Action.STICKS, None))
+    found = beat.intervals()
+    assert (found.count, found.max_s) == (4, pytest.approx(0.330))
+    assert (found.own_count, found.own_max_s) == (2, pytest.approx(0.022))
 
 
 def test_nothing_held_is_no_interval() -> None:
