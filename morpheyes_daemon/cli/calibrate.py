@@ -176,6 +176,8 @@ def evaluate(
         f"all 41: rows {truth.epipolar_median_px:.3f} px median, {truth.epipolar_p95_px:.3f} px at 95 %; length "
         f"within {truth.baseline_error_max_mm:.3f} mm; disparity bias within {truth.disparity_bias_max_px:.3f} px"
     )
+    near, far = truth.pointing_error_deg
+    typer.echo(f"the left eye points {near:.2f} degrees (smallest baseline) and {far:.2f} (largest) off where it is believed")
     if watch:
         _print_watch(figures["watch"])
     for name, row in figures.get("at_calibrated_baselines", {}).items():

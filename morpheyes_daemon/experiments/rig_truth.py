@@ -33,13 +33,14 @@ _DEPTHS_M = (0.7, 1.0, 2.0, 5.0, 20.0)
 
 @dataclass(frozen=True)
 class BaselineTruth:
-    """Errors at one nominal baseline: rows (median, 95 %), length, and disparity at infinity."""
+    """Errors at one nominal baseline: rows (median, 95 %), length, disparity at infinity, where the left eye points."""
 
     nominal_mm: float
     epipolar_median_px: float
     epipolar_p95_px: float
     baseline_error_mm: float
     disparity_bias_px: float
+    pointing_error_deg: float
 
 
 @dataclass(frozen=True)
@@ -60,13 +61,20 @@ class RigTruth:
         """Largest disparity of points at infinity, median over the image."""
         return max(abs(row.disparity_bias_px) for row in self.rows)
 
+    @property
+    def pointing_error_deg(self) -> tuple[float, float]:
+        """Angle between where the left eye points on the vehicle and where it is believed to: smallest baseline, largest."""
+        return self.rows[0].pointing_error_deg, self.rows[-1].pointing_error_deg
+
     def figures(self) -> dict[str, Any]:
         """Return what `calibrate evaluate --json` prints."""
+        near, far = self.pointing_error_deg
         return {
             "epipolar_median_px": round(self.epipolar_median_px, 4),
             "epipolar_p95_px": round(self.epipolar_p95_px, 4),
             "baseline_error_max_mm": round(self.baseline_error_max_mm, 4),
             "disparity_bias_max_px": round(self.disparity_bias_max_px, 4),
+            "pointing_error_deg": [round(near, 4), round(far, 4)],
         }
 
 
@@ -88,12 +96,14 @@ def _at(rig: RigModel, twin: RigTwin, nominal_m: float) -> tuple[BaselineTruth, 
     true = StereoGeometry(twin.cam0, twin.cam1, twin.T_cam0_cam1(twin.actual_m(nominal_m)))
     left, right = true_projections(true)
     row_px = row_error_px(believed, left, right)
+    points = rig.R_rig_cam0[:, 2], twin.T_rig_eye(0, twin.actual_m(nominal_m))[:3, 2]
     truth = BaselineTruth(
         nominal_mm=nominal_m * 1e3,
         epipolar_median_px=float(np.median(np.abs(row_px))),
         epipolar_p95_px=float(np.percentile(np.abs(row_px), 95)),
         baseline_error_mm=(believed.length_m - true.length_m) * 1e3,
         disparity_bias_px=float(np.median(infinity_px(believed, true))),
+        pointing_error_deg=float(np.degrees(np.linalg.norm(np.cross(*points)))),
     )
     return truth, row_px
 

@@ -168,6 +168,12 @@ def test_the_eyes_mount_is_measured_and_written_into_the_file(tmp_path: Path, te
     assert max(found["sigma_deg"]) < 0.15
     assert RigModel.load(tmp_path / "mounted.yaml").mount is not None
     assert RigModel.load(file).mount is None
+    before, after = (
+        json.loads(terminal("evaluate", one, "--seed", 0, "--json")[1])["pointing_error_deg"][0]
+        for one in (file, tmp_path / "mounted.yaml")
+    )
+    assert before == pytest.approx(0.61, abs=0.02)
+    assert after < 0.25
     code, out, _ = terminal("mount", file, held)
     assert "the left eye is turned up by -0." in out
     assert RigModel.load(file).mount is not None
