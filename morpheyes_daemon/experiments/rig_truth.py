@@ -63,7 +63,7 @@ class RigTruth:
 
     @property
     def pointing_error_deg(self) -> tuple[float, float]:
-        """Angle between where the left eye points on the vehicle and where it is believed to: smallest baseline, largest."""
+        """How far off the left eye is believed to point on the vehicle, at the smallest and the largest baseline."""
         return self.rows[0].pointing_error_deg, self.rows[-1].pointing_error_deg
 
     def figures(self) -> dict[str, Any]:
