@@ -177,7 +177,7 @@ def evaluate(
         f"within {truth.baseline_error_max_mm:.3f} mm; disparity bias within {truth.disparity_bias_max_px:.3f} px"
     )
     near, far = truth.pointing_error_deg
-    typer.echo(f"left eye: points {near:.2f} degrees off (smallest baseline), {far:.2f} (largest) from where it should")
+    typer.echo(f"left eye believed to point {near:.2f} degrees aside at the smallest baseline, {far:.2f} at the largest")
     if watch:
         _print_watch(figures["watch"])
     for name, row in figures.get("at_calibrated_baselines", {}).items():
