@@ -87,10 +87,9 @@ def R_from_q(q: Array) -> Array:
 
 def rotvec_from_R(R: Array) -> Array:
     """Return the rotation vector (3,), at most pi long, of a rotation matrix (3, 3)."""
-    w, *xyz = q_from_R(R).tolist()
-    half_sine = math.hypot(*xyz)
-    scale = 2.0 if half_sine < 1e-12 else 2.0 * math.atan2(half_sine, w) / half_sine
-    return np.array(xyz) * scale
+    q = q_from_R(R)
+    sine = float(np.linalg.norm(q[1:]))
+    return np.asarray(q[1:] * (2.0 if sine < 1e-12 else 2.0 * np.arctan2(sine, q[0]) / sine))
 
 
 def pose(R: Array, t: Array) -> Array:

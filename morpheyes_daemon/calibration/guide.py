@@ -16,6 +16,9 @@ from morpheyes_daemon.calibration.coverage import CELLS, cell_of, count_cells, e
 from morpheyes_daemon.messages import Image
 from morpheyes_daemon.transforms import Array
 
+BASELINE_VIEWS = 12
+"""Pairs that make a baseline complete."""
+
 _STILL_PX = 0.7
 """Corners that move by more between two frames blur, and the eyes expose at different times."""
 _NEW_CELLS = 3
@@ -48,7 +51,7 @@ class CaptureGuide:
 
     board: Board
     size: tuple[int, int]
-    wanted: int = 12
+    wanted: int = BASELINE_VIEWS
     _kept: list[_Seen] = field(default_factory=list)
     _last: Array | None = None
 

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.calibration.boards import Board, find_corners
+from morpheyes_daemon.calibration.start import board_pose
 from morpheyes_daemon.calibration.views import Progress, silent
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.messages import Image
@@ -27,15 +28,15 @@ from morpheyes_daemon.transforms import Array, R_from_rotvec, R_from_rpy, rotvec
 ATTITUDES = "attitudes.csv"
 COLUMNS = ("picture", "roll_deg", "pitch_deg", "yaw_deg")
 
-FEWEST_VIEWS = 10
+MOUNT_VIEWS, FEWEST_VIEWS = 48, 10
+"""Pictures to take, and to work with at least."""
+
 WORST_SIGMA_RAD = 4e-3
 """One sigma of a rotation that is no better than a careful builder's eye."""
 
 _ROUNDS = 20
 _STRAY = 3.0
 """A view whose rotations disagree by so many times the median counts less and less."""
-
-_CORNERS_FEWEST = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +56,7 @@ class MountSolution:
     mount: EyeMount
     rms_rad: float
     turned_rad: float
-    """How far the vehicle was turned, root mean square about each view's own mean."""
+    """How far the vehicle was turned, root mean square about the middle of its attitudes."""
 
 
 def solve_mount(views: MountViews, R_frd_rig: Array, turns: int) -> MountSolution:
@@ -80,10 +81,9 @@ def solve_mount(views: MountViews, R_frd_rig: Array, turns: int) -> MountSolutio
         if np.abs(step).max() < 1e-10:
             break
     rms = math.sqrt(float(((off.ravel() * weight) ** 2).sum() / ((weight**2).sum() - 6)))
-    information = (J * weight[:, None]).T @ (J * weight[:, None])
-    sigma = rms * np.sqrt(np.diag(np.linalg.inv(information))[:3])
+    sigma = rms * _sigmas((J * weight[:, None]).T @ (J * weight[:, None]))
     turned = _turned_rad(A)
-    if sigma.max() > WORST_SIGMA_RAD:
+    if not sigma.max() <= WORST_SIGMA_RAD:
         raise CalibrationError(
             f"The eye's rotation is only known to {math.degrees(float(sigma.max())):.2f} degrees: turn the vehicle "
             f"farther (these pictures: {math.degrees(turned):.0f} degrees) about all three axes, and hold it still."
@@ -122,12 +122,8 @@ def board_rotation(image: Image, board: Board, cam0: CameraIntrinsics) -> Array 
     if corners is None:
         return None
     height, width = image.shape[:2]
-    normalised = cam0.rescaled(width, height).normalised_from_pixels(corners)
-    seen = np.isfinite(normalised).all(axis=1)
-    if seen.sum() < _CORNERS_FEWEST:
-        return None
-    found, rotation, _ = cv2.solvePnP(board.points_m[seen], normalised[seen], np.eye(3), None)
-    return R_from_rotvec(np.asarray(rotation, np.float64).ravel()) if found else None
+    T_cam0_board = board_pose(corners, board, cam0.rescaled(width, height))
+    return None if T_cam0_board is None else T_cam0_board[:3, :3]
 
 
 def ways_up(board: Board) -> int:
@@ -176,7 +172,15 @@ def _huber(off: Array) -> Array:
     return np.asarray(np.minimum(1.0, limit / np.maximum(off, 1e-12)))
 
 
+def _sigmas(information: Array) -> Array:
+    """Return one sigma (3,) of the eye's rotation for unit noise, infinite where the vehicle was not turned at all."""
+    values, vectors = np.linalg.eigh(information)
+    if values[0] < 1e-6 * values[-1]:
+        return np.full(3, np.inf)
+    return np.asarray(np.sqrt(np.diag(vectors / values @ vectors.T)[:3]))
+
+
 def _turned_rad(A: Array) -> float:
-    """Return the root mean square angle of the attitudes about the first, over their mean."""
+    """Return the root mean square angle of the attitudes about their middle."""
     vectors = np.array([rotvec_from_R(A[0].T @ R) for R in A])
     return math.sqrt(float(((vectors - vectors.mean(axis=0)) ** 2).sum(axis=1).mean()))

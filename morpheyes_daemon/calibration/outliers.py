@@ -107,7 +107,7 @@ def _guilty(observations: Observations, solution: Solution, view: int, rms: Arra
 def _rms_alone(observations: Observations, solution: Solution, view: int, eye: int) -> float:
     """Return the rms of one picture with a board pose of its own."""
     camera = camera_from_vector(solution.state.eyes[eye], observations.size)
-    T_cam_board = board_pose(observations, view, eye, camera)
+    T_cam_board = board_pose((observations.left, observations.right)[eye][view], observations.board, camera)
     if T_cam_board is None:
         return np.inf
     p_cam = observations.board.points_m @ T_cam_board[:3, :3].T + T_cam_board[:3, 3]

@@ -20,7 +20,7 @@ from morpheyes_daemon.calibration.start import board_pose
 from morpheyes_daemon.calibration.views import Observations, Progress, silent
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.stereo.rig import RigModel
-from morpheyes_daemon.transforms import Array, q_from_R
+from morpheyes_daemon.transforms import Array, rotvec_from_R
 
 _TURN_SIGMA_RAD = 1e-5
 _SHIFT_SIGMA_M = 1e-5
@@ -119,17 +119,14 @@ def draw(found: list[Position]) -> Figure:
 
 def _length_m(rig: RigModel, observations: Observations, view: int, target_m: float) -> float | None:
     """Return the baseline of one visit, None when an eye does not see the board."""
-    T_cam0_board = board_pose(observations, view, 0, rig.cam0)
+    T_cam0_board = board_pose(observations.left[view], observations.board, rig.cam0)
     if T_cam0_board is None or not np.isfinite(observations.right[view, :, 0]).any():
         return None
     chosen = np.zeros(observations.view_count, dtype=np.bool_)
     chosen[view] = True
     one = replace(observations.subset(chosen), nominal_m=np.array([target_m]), baseline=np.zeros(1, dtype=np.intp))
     T_cam0_cam1 = rig.T_cam0_cam1(target_m)
-    q = q_from_R(T_cam0_cam1[:3, :3])
-    sine = float(np.linalg.norm(q[1:]))
-    rotvec = q[1:] * (2.0 * np.arctan2(sine, q[0]) / sine if sine > 1e-12 else 2.0)
-    between = np.concatenate([rotvec, T_cam0_cam1[:3, 3]])
+    between = np.concatenate([rotvec_from_R(T_cam0_cam1[:3, :3]), T_cam0_cam1[:3, 3]])
     eyes = np.stack([camera_vector(rig.cam0), camera_vector(rig.cam1)])
     state = RigState(eyes, between[None], T_cam0_board[None, :3, :3], T_cam0_board[None, :3, 3])
     solved = bundle.solve(one, state, _known_but_for_length(state, T_cam0_cam1[:3, 3]), _CORNER_SIGMA_PX)

@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from morpheyes_daemon.calibration.boards import Board
 from morpheyes_daemon.calibration.bundle import RigState
 from morpheyes_daemon.calibration.projection import camera_from_vector
 from morpheyes_daemon.calibration.views import Observations
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
-from morpheyes_daemon.transforms import Array, R_from_rotvec, inverse, pose, q_from_R
+from morpheyes_daemon.transforms import Array, R_from_rotvec, inverse, pose, rotvec_from_R
 
 _VIEWS_PER_CAMERA = 30
 _FEWEST_CORNERS = 8
@@ -28,8 +29,8 @@ def first_guess(observations: Observations) -> tuple[RigState, NDArray[np.bool_]
     The state covers the usable views only. Raises InputError when a camera cannot be guessed.
     """
     cameras = [_camera(observations, eye) for eye in (0, 1)]
-    T_left = [board_pose(observations, view, 0, cameras[0]) for view in range(observations.view_count)]
-    T_right = [board_pose(observations, view, 1, cameras[1]) for view in range(observations.view_count)]
+    T_left = [board_pose(corners, observations.board, cameras[0]) for corners in observations.left]
+    T_right = [board_pose(corners, observations.board, cameras[1]) for corners in observations.right]
     between = np.array([_between(observations, i, T_left, T_right) for i in range(len(observations.nominal_m))])
     poses: list[Array | None] = []
     for view, (left, right) in enumerate(zip(T_left, T_right, strict=True)):
@@ -41,14 +42,13 @@ def first_guess(observations: Observations) -> tuple[RigState, NDArray[np.bool_]
     return RigState(eyes, between, boards[:, :3, :3], boards[:, :3, 3]), usable
 
 
-def board_pose(observations: Observations, view: int, eye: int, camera: CameraIntrinsics) -> Array | None:
-    """Return T_cam_board (4, 4) of one eye's view by itself, None when too few corners are seen."""
-    pixels = (observations.left, observations.right)[eye][view]
+def board_pose(pixels: Array, board: Board, camera: CameraIntrinsics) -> Array | None:
+    """Return T_cam_board (4, 4) of corners (n, 2), NaN where unseen; None when too few corners are seen."""
     seen = np.isfinite(pixels[:, 0])
     if np.count_nonzero(seen) < _FEWEST_CORNERS:
         return None
     rays = camera.normalised_from_pixels(pixels[seen])
-    points = observations.board.points_m[seen]
+    points = board.points_m[seen]
     straight = np.isfinite(rays[:, 0])
     if np.count_nonzero(straight) < _FEWEST_CORNERS:
         return None
@@ -102,14 +102,8 @@ def _between(
         raise InputError(
             f"At {observations.nominal_m[baseline] * 1e3:g} mm no picture shows the board to both eyes; retake them."
         )
-    vectors = np.array([[*_rotvec(T[:3, :3]), *T[:3, 3]] for T in poses])
+    vectors = np.array([[*rotvec_from_R(T[:3, :3]), *T[:3, 3]] for T in poses])
     return np.asarray(np.median(vectors, axis=0))
-
-
-def _rotvec(R: Array) -> Array:
-    q = q_from_R(R)
-    sine = float(np.linalg.norm(q[1:]))
-    return q[1:] * (2.0 if sine < 1e-12 else 2.0 * np.arctan2(sine, q[0]) / sine)
 
 
 def _pose_of(vector: Array) -> Array:

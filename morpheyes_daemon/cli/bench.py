@@ -51,7 +51,7 @@ def sticks(
         ("stick messages", f"{beat.count} in {found.minutes:g} minutes, {found.frames} frames seen"),
         ("interval", _beat(beat.p50_s, beat.p99_s, beat.max_s)),
         ("loop lateness", f"{found.worst_lateness_ms:.1f} ms at worst"),
-        ("taken by the host", f"{found.stolen_s:.1f} s of processor time, on a virtual machine"),
+        ("taken by the host", f"{beat.stolen_s:.1f} s of processor time, on a virtual machine"),
         ("while it took none", f"{beat.own_count}: p99 {_ms(beat.own_p99_s)}, largest {_ms(beat.own_max_s)}"),
         ("at the end", found.final_state),
     ]

@@ -15,6 +15,7 @@ from morpheyes_daemon.cli.calibrate_live import (
     JsonOption,
     MarkerOption,
     SquareOption,
+    ViewsOption,
     capture,
     check,
     repeatability,
@@ -82,9 +83,7 @@ def render(
     baselines_mm: Annotated[
         str, typer.Option("--baselines", help="How many, equally spaced over 100-300 mm, or lengths such as 100,200.")
     ] = "10",
-    views: Annotated[
-        int | None, typer.Option("--views", min=3, max=200, help="Pairs per baseline; default: 12, for the mount 48.")
-    ] = None,
+    views: ViewsOption = None,
     mount: Annotated[
         bool, typer.Option("--mount", help="A board on a wall, the vehicle turned by hand: for `mount`.")
     ] = False,
@@ -96,11 +95,11 @@ def render(
     marker_mm: MarkerOption = None,
 ) -> None:
     """Render boards before the simulator's camera, as folders that `solve` takes."""
+    from morpheyes_daemon.calibration.guide import BASELINE_VIEWS
+    from morpheyes_daemon.calibration.mount import MOUNT_VIEWS
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.experiments.rendered_boards import (
         DEFAULT_BOARD,
-        DEFAULT_VIEWS,
-        MOUNT_VIEWS,
         render_folder,
         render_mount_folder,
     )
@@ -115,9 +114,9 @@ def render(
         return
     nominal_m = choose_baselines_m(baselines_mm, RANGE_M)
     with progress_line() as progress:
-        render_folder(out, seed, nominal_m, views or DEFAULT_VIEWS, chosen, _size(size), visits, progress)
+        render_folder(out, seed, nominal_m, views or BASELINE_VIEWS, chosen, _size(size), visits, progress)
     typer.echo(
-        f"{len(nominal_m)} baselines, {views or DEFAULT_VIEWS} pairs each: {out}; next: morpheyes calibrate solve {out}"
+        f"{len(nominal_m)} baselines, {views or BASELINE_VIEWS} pairs each: {out}; next: morpheyes calibrate solve {out}"
     )
 
 

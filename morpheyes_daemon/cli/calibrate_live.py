@@ -16,13 +16,14 @@ if TYPE_CHECKING:
     from morpheyes_daemon.messages import Image
     from morpheyes_daemon.workshop.capture import Scene
 
-BASELINE_VIEWS, MOUNT_VIEWS = 12, 48
-
 BoardOption = Annotated[
     str | None, typer.Option("--board", help="Inner corners such as 9x6, or squares such as charuco:10x7:5X5_1000.")
 ]
 SquareOption = Annotated[float | None, typer.Option("--square-mm", help="Side of one square, measured.")]
 MarkerOption = Annotated[float | None, typer.Option("--marker-mm", help="Side of one marker of a ChArUco board.")]
+ViewsOption = Annotated[
+    int | None, typer.Option("--views", min=3, max=200, help="Pairs per baseline; default: 12, for the mount 48.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Vehicle configuration; default: config.yaml.")]
 
@@ -31,9 +32,7 @@ def capture(
     out: Annotated[Path, typer.Argument(help="Folder for the pictures; goes on where it stopped.")],
     config: ConfigOption = None,
     baselines_mm: Annotated[str, typer.Option("--baselines", help="How many, or lengths such as 100,200.")] = "10",
-    views: Annotated[
-        int | None, typer.Option("--views", min=3, max=200, help="Pairs per baseline; default: 12, for the mount 48.")
-    ] = None,
+    views: ViewsOption = None,
     mount: Annotated[
         bool, typer.Option("--mount", help="The board stands, the vehicle is turned by hand: for `mount`.")
     ] = False,
@@ -52,6 +51,8 @@ def capture(
     import asyncio
 
     from morpheyes_daemon.calibration.folder_solve import read_board_file
+    from morpheyes_daemon.calibration.guide import BASELINE_VIEWS
+    from morpheyes_daemon.calibration.mount import MOUNT_VIEWS
     from morpheyes_daemon.cli.calibrate import choose_baselines_m, choose_board
     from morpheyes_daemon.clock import running_clock
     from morpheyes_daemon.devices.link import open_link

@@ -74,7 +74,7 @@ def _calibration_verdict(rig: RigModel, config: VehicleConfig) -> list[Finding]:
 
 
 def _mount(rig: RigModel, config: VehicleConfig) -> list[Finding]:
-    if rig.mount is not None or config.camera.backend in ("sim", "recording"):
+    if rig.mount is not None:
         return []
     return [
         Finding(

@@ -20,7 +20,7 @@ from morpheyes_daemon.clock import S, running_clock
 from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.experiments.flight import FlightPlan, Progress
 from morpheyes_daemon.experiments.realtime import RealtimeFlight, realtime_daemon
-from morpheyes_daemon.experiments.stick_beat import StickIntervals, stolen_s
+from morpheyes_daemon.experiments.stick_beat import StickIntervals
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.service import real_time_runner
 
@@ -36,16 +36,12 @@ Show = Callable[[Progress], None]
 
 @dataclass(frozen=True, slots=True)
 class StickBench:
-    """Seconds between stick messages over `minutes`; `frames` tells the load.
-
-    `stolen_s` is the processor time that the host of a virtual machine gave to others meanwhile.
-    """
+    """The beat of the sticks over `minutes`; `frames` tells the load."""
 
     minutes: float
     beat: StickIntervals
     frames: int
     worst_lateness_ms: float
-    stolen_s: float
     final_state: str
 
 
@@ -95,7 +91,6 @@ def bench_soak(plan: FlightPlan, minutes: float, show: Show) -> SoakBench:
 async def _sticks(plan: FlightPlan, minutes: float, show: Show, folder: Path) -> StickBench:
     async with realtime_daemon(plan, folder / "flight.mcap", None, show) as flight:
         await _engaged(flight)
-        stolen_before_s = stolen_s()
         await _live(flight, minutes * 60.0)
         health = flight.daemon.topics.health.get()
         return StickBench(
@@ -103,7 +98,6 @@ async def _sticks(plan: FlightPlan, minutes: float, show: Show, folder: Path) ->
             beat=flight.beat.intervals(),
             frames=flight.tally.frames,
             worst_lateness_ms=health.worst_lateness_ms if health is not None else 0.0,
-            stolen_s=stolen_s() - stolen_before_s,
             final_state=str(flight.daemon.guardian.state),
         )
 

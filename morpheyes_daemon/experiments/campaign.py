@@ -64,16 +64,10 @@ class Campaign:
             "latency_ms": stereo.latency_ms,
             "disparities_fraction": stereo.disparities_fraction,
             "wind_m_s": plan.scenario.wind_m_s,
-            "calibration": calibration_kind(plan.calibration),
+            "calibration": RigModel.load(plan.calibration).origin,
             "seeds": [self.seeds[0], self.seeds[-1]],
             "baselines": list(self.baselines),
         }
-
-
-def calibration_kind(file: Path) -> str:
-    """Return how a calibration file came about: solved, mounted (the eyes' mount was measured as well) or exact."""
-    rig = RigModel.load(file)
-    return rig.method if rig.mount is None else "mounted"
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

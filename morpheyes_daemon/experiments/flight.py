@@ -254,7 +254,7 @@ def summarize_flight(
         mission=plan.mission_name,
         seed=plan.scenario.seed,
         baseline_mode="variable" if hold_mm is None else f"{hold_mm / 1e3:g}",
-        calibration=RigModel.load(plan.calibration).method,
+        calibration=RigModel.load(plan.calibration).origin,
         outcome=verdict.outcome,
         reason=verdict.reason,
         time_s=verdict.time_s,

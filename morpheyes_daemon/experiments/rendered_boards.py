@@ -17,7 +17,8 @@ import numpy as np
 import yaml
 
 from morpheyes_daemon.calibration.boards import Board, aligned, find_corners
-from morpheyes_daemon.calibration.mount import ATTITUDES, COLUMNS, MountViews, board_rotation
+from morpheyes_daemon.calibration.guide import BASELINE_VIEWS
+from morpheyes_daemon.calibration.mount import ATTITUDES, COLUMNS, MOUNT_VIEWS, MountViews, board_rotation
 from morpheyes_daemon.calibration.views import Observations, Progress, silent
 from morpheyes_daemon.config import ServoMotion
 from morpheyes_daemon.errors import InputError
@@ -29,8 +30,6 @@ from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.transforms import Array, R_from_rpy, rpy_from_R
 
 DEFAULT_BOARD = Board(9, 6, 0.025)
-DEFAULT_VIEWS = 12
-MOUNT_VIEWS = 48
 DEFAULT_BASELINES_M = tuple(round(float(b), 4) for b in np.linspace(*RANGE_M, 10))
 """Ten equally spaced baselines (paper, section III-B), to a tenth of a millimetre as the folders name them."""
 _WORKERS = 2
@@ -62,7 +61,7 @@ def render_folder(
     out: Path,
     seed: int,
     nominal_m: Sequence[float] = DEFAULT_BASELINES_M,
-    views: int = DEFAULT_VIEWS,
+    views: int = BASELINE_VIEWS,
     board: Board = DEFAULT_BOARD,
     size: tuple[int, int] = (640, 480),
     visits: bool = False,
@@ -139,7 +138,7 @@ def _hand_turned(twin: RigTwin, seed: int, views: int, board: Board) -> Iterator
 def observe_twin(
     seed: int,
     nominal_m: Sequence[float] = DEFAULT_BASELINES_M,
-    views: int = DEFAULT_VIEWS,
+    views: int = BASELINE_VIEWS,
     board: Board = DEFAULT_BOARD,
     size: tuple[int, int] = (640, 480),
     progress: Progress = silent,

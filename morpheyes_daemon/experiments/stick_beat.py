@@ -21,13 +21,19 @@ from morpheyes_daemon.safety.states import Action
 
 
 def stolen_s() -> float:
-    """Return the processor time that the machine's host gave to others since boot (`steal` of /proc/stat)."""
-    return int(Path("/proc/stat").read_text().split(maxsplit=9)[8]) / os.sysconf("SC_CLK_TCK")
+    """Return the processor time that the machine's host gave to others since boot; 0 where no /proc/stat counts it."""
+    try:
+        return int(Path("/proc/stat").read_text().split(maxsplit=9)[8]) / os.sysconf("SC_CLK_TCK")
+    except OSError:
+        return 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class StickIntervals:
-    """Seconds between stick messages; `own_` are those in which the machine's host took no processor time."""
+    """Seconds between stick messages, `stolen_s` of processor time taken by the machine's host meanwhile.
+
+    `own_` are the intervals in which it took none.
+    """
 
     count: int = 0
     p50_s: float = 0.0
@@ -36,6 +42,7 @@ class StickIntervals:
     own_count: int = 0
     own_p99_s: float = 0.0
     own_max_s: float = 0.0
+    stolen_s: float = 0.0
 
 
 class StickBeat:
@@ -55,7 +62,7 @@ class StickBeat:
         seconds = np.array(self._intervals_ns) / S
         own = seconds[np.array(self._stolen_s) == 0.0]
         p50, p99 = (float(value) for value in np.percentile(seconds, (50.0, 99.0)))
-        found = StickIntervals(len(seconds), p50, p99, float(seconds.max()))
+        found = StickIntervals(len(seconds), p50, p99, float(seconds.max()), stolen_s=sum(self._stolen_s))
         if not own.size:
             return found
         return replace(found, own_count=len(own), own_p99_s=float(np.percentile(own, 99.0)), own_max_s=float(own.max()))

@@ -149,6 +149,11 @@ class RigModel:
         return self.baselines_m[0], self.baselines_m[-1]
 
     @property
+    def origin(self) -> str:
+        """How the file came about: its method, or "mounted" where the eyes' mount was measured as well."""
+        return self.method if self.mount is None else "mounted"
+
+    @property
     def R_rig_cam0(self) -> Array:
         """The left eye's rotation (3, 3) on the bar; none where it was not measured."""
         return np.eye(3) if self.mount is None else R_from_rotvec(np.array(self.mount.rotation_rad))

@@ -21,7 +21,7 @@ POSITION_WALK_M_S = 0.025
 """Random walk of where an opening seems to be, metres per root second: the autopilot's own position drifts by 0.02."""
 
 POINTING_RAD, POINTING_WALK_RAD_S = 0.008, 0.004
-"""One sigma of the eyes' direction on the body, which no board tells, and its walk per root second: the attitude's."""
+"""One sigma of the eyes' direction on the body, and its walk per root second: the attitude's."""
 
 MOVING_M_S, MOVING_M_S2 = 0.5, 0.4
 """Speed and acceleration of a moving wall that the filter reckons with."""

@@ -69,6 +69,16 @@ def test_a_vehicle_that_was_hardly_turned_is_refused() -> None:
         solve_mount(turned(30, 0.03, 3.5e-3), R_FRD_RIG, 2)
 
 
+@pytest.mark.parametrize("axes", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_a_vehicle_that_was_turned_about_one_axis_or_none_is_refused(axes: tuple[float, float, float]) -> None:
+    views = turned(12, 0.5, 0.0)
+    attitudes = [R_from_rotvec(np.array(axes) * 0.1 * k) for k in range(12)]
+    wall = R_FRD_RIG
+    seen = [(attitude @ R_FRD_RIG @ R_from_rotvec(TRUE)).T @ wall for attitude in attitudes]
+    with pytest.raises(CalibrationError, match="turn the vehicle farther"):
+        solve_mount(replace(views, R_ned_frd=np.array(attitudes), R_cam0_board=np.array(seen)), R_FRD_RIG, 2)
+
+
 def test_too_few_pictures_are_refused() -> None:
     with pytest.raises(CalibrationError, match="9 pictures show the board, 10 are needed"):
         solve_mount(turned(9, 0.5, 0.0), R_FRD_RIG, 2)

@@ -37,6 +37,7 @@ def test_what_the_machines_host_took_is_told_apart() -> None:
     found = beat.intervals()
     assert (found.count, found.max_s) == (4, pytest.approx(0.330))
     assert (found.own_count, found.own_max_s) == (2, pytest.approx(0.022))
+    assert found.stolen_s == pytest.approx(0.31)
 
 
 def test_nothing_held_is_no_interval() -> None:
