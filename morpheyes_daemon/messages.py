@@ -157,6 +157,8 @@ class VehicleState:
 
     `rc_us` are RC_CHANNELS 1..16 (0: absent), `rc_rssi` their signal strength 0..254 (255: not measured).
     `position_t_ns` stamps p and v. `custom_mode` is ArduCopter's number.
+    `sensors_present` and `sensors_health` are the bits of SYS_STATUS, `gps_fix` is GPS_RAW_INT's type of fix (-1: never
+    told).
     """
 
     t_ns: int = 0
@@ -179,6 +181,9 @@ class VehicleState:
     rc_rssi: int = 255
     ekf_t_ns: int = 0
     ekf_flags: int = 0
+    sensors_present: int = 0
+    sensors_health: int = 0
+    gps_fix: int = -1
     battery_t_ns: int = 0
     battery_v: float = math.nan
     battery_fraction: float = math.nan

@@ -76,3 +76,4 @@ class Reason(StrEnum):
     AUTOPILOT_REBOOTED = "autopilot_rebooted", 92, "the autopilot restarted"
     RECORDER_FAILED = "recorder_failed", 93, "the flight log cannot be written"
     CLOCK_STEPPED = "clock_stepped", 94, "the clock jumped"
+    AIDING_LOST = "aiding_lost", 95, "the autopilot lost its optical flow or its GPS fix"

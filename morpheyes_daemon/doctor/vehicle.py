@@ -19,6 +19,7 @@ from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.doctor.parameter_rules import examine_parameters
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages import Event, VehicleState
+from morpheyes_daemon.safety.concerns import GPS, aided
 from morpheyes_daemon.wire.mavlink import dialect
 
 LINK_S, PARAMETERS_S = 8.0, 60.0
@@ -166,8 +167,9 @@ class VehicleExamination:
             findings.append(_finding("battery-low", Severity.STOP,
                                      f"{state.battery_fraction:.0%} left, {state.battery_v:.1f} V",
                                      "the battery failsafe takes the flight over", "change the battery"))  # fmt: skip
-        if not _has_position(state.ekf_flags):
-            findings.append(_finding("no-position-yet", Severity.CARE, f"EKF flags are {state.ekf_flags:#x}",
+        if not (_has_position(state.ekf_flags) and aided(state)):
+            fix = f", the GPS fix is of type {state.gps_fix}" if state.sensors_present & GPS else ""
+            findings.append(_finding("no-position-yet", Severity.CARE, f"EKF flags are {state.ekf_flags:#x}{fix}",
                                      "Loiter cannot be entered",
                                      "wait for GPS; without one send the origin once and stand within the"
                                      " rangefinder's reach"))  # fmt: skip

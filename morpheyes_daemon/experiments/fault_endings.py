@@ -50,7 +50,8 @@ class Fault:
     """One row: `begin` breaks something, `end` mends it after `lasts_s`. `notice_s` is the declared detection time.
 
     `watch_s` is how long to look on; `falls`: the motors stop, so that hitting something says nothing. `rig_seed`
-    flies another rig than the one that was calibrated, None the calibration missing.
+    flies another rig than the one that was calibrated, None the calibration missing; `without_gps` flies on optical
+    flow.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Fault:
     watch_s: float = 7.0
     falls: bool = False
     rig_seed: int | None = 0
+    without_gps: bool = False
 
     def watched_s(self, state: State) -> float:
         """How long to look on: less where nothing moves that would have to stop."""

@@ -37,6 +37,7 @@ from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.simulation.flight_modes import Mode
 from morpheyes_daemon.supervisor.worker import InlineWorker
 
 NEUTRAL_US = (1500, 1500, 1500, 1500)
@@ -263,7 +264,11 @@ def _quiet_s(sent: list[tuple[float, Sent]]) -> float | None:
 
 
 class _Path:
-    """The true way of the vehicle from where it is."""
+    """The true way of the vehicle from where it is.
+
+    What comes near counts in Loiter alone: in LAND or RTL nobody but the autopilot steers, and without a position it
+    drifts.
+    """
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
@@ -282,7 +287,8 @@ class _Path:
         if not self.at_rest:
             self.to_rest_m = self._flown_m
             self.at_rest = math.hypot(truth.v_ned_m_s[0], truth.v_ned_m_s[1]) < AT_REST_M_S
-        self.clearance_m = min(self.clearance_m, self._stage.clearance_m(t_ns))
+        if self._stage.autopilot.autopilot.mode is Mode.LOITER:
+            self.clearance_m = min(self.clearance_m, self._stage.clearance_m(t_ns))
 
 
 __all__ = ["AUTOPILOT_URL", "FaultFlight", "Measured", "Sent"]

@@ -122,25 +122,16 @@ def _row_of(values: dict[str, Any]) -> Row:
 
 
 def _fly_seed(plan: FlightPlan, state: State, faults: list[Fault], jobs: int, done: Callable[[Row], None]) -> None:
-    shared = [fault for fault in faults if fault.rig_seed == 0]
-    for fault in faults:
-        if fault.rig_seed != 0:
-            _fly_alone(plan, fault, done)
-    if shared:
-        run_virtual(_fly_state(plan, state, shared, jobs, done))
-
-
-def _fly_alone(plan: FlightPlan, fault: Fault, done: Callable[[Row], None]) -> None:
-    """A fault that is there before the daemon starts: its calibration."""
-    if fault.rig_seed is None:
-        plan = replace(plan, calibration=plan.calibration.with_name("missing.yaml"))
-    else:
-        plan = replace(plan, scenario=replace(plan.scenario, rig_seed=fault.rig_seed))
-    try:
-        run_virtual(_fly_state(plan, State.PREFLIGHT, [fault], 1, done))
-    except CalibrationError as error:
-        refused = fault.endings[State.PREFLIGHT] is Ending.REFUSES
-        done(make_row(fault, State.PREFLIGHT, plan.scenario.seed, None, () if refused else (str(error),)))
+    for rig_seed, without_gps in dict.fromkeys((fault.rig_seed, fault.without_gps) for fault in faults):
+        alike = [fault for fault in faults if (fault.rig_seed, fault.without_gps) == (rig_seed, without_gps)]
+        scenario = replace(plan.scenario, rig_seed=rig_seed or 0, without_gps=without_gps)
+        calibration = plan.calibration if rig_seed is not None else plan.calibration.with_name("missing.yaml")
+        try:
+            run_virtual(_fly_state(replace(plan, scenario=scenario, calibration=calibration), state, alike, jobs, done))
+        except CalibrationError as error:
+            for fault in alike:
+                refused = fault.endings[state] is Ending.REFUSES
+                done(make_row(fault, state, scenario.seed, None, () if refused else (str(error),)))
 
 
 async def _fly_state(

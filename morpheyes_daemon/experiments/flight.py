@@ -279,7 +279,7 @@ def summarize_flight(
 def make_crew(stage: Stage) -> GroundCrew:
     """Return a ground crew with an in-memory link of its own."""
     ours, theirs = MemoryLink.pair(LINK_DELAY_S)
-    crew = GroundCrew(stage.radio, ours, stage.clock)
+    crew = GroundCrew(stage.radio, ours, stage.clock, without_gps=stage.autopilot.parameters.flow_only)
     ours.on_bytes = crew.on_bytes
     theirs.on_bytes = stage.autopilot.attach(theirs)
     return crew

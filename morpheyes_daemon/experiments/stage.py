@@ -16,6 +16,7 @@ from morpheyes_daemon.clock import MS, Clock, S
 from morpheyes_daemon.config import NoServoConfig, VehicleConfig
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.collision import VehicleShape
@@ -39,7 +40,8 @@ WIND_M_S = 2.0
 class Scenario:
     """What differs between simulated flights; everything random comes from `seed`.
 
-    `rig_seed` is the rig that was calibrated; it does not change from flight to flight.
+    `rig_seed` is the rig that was calibrated; it does not change from flight to flight. `without_gps` flies on optical
+    flow.
     """
 
     world: str
@@ -47,6 +49,7 @@ class Scenario:
     rig_seed: int = 0
     wind_m_s: float = WIND_M_S
     sensor: Sensor = Sensor()
+    without_gps: bool = False
 
 
 class FlyingVehicle(Protocol):
@@ -87,7 +90,8 @@ class Stage:
         craft = Vehicle(
             wind=wind, seed=seed, start_ned_m=(north, east), yaw_rad=self.world.heading_rad, ground=self.world.ground
         )
-        self.autopilot = AutopilotTwin(craft, clock, seed=seed)
+        parameters = {**RECOMMENDED, **(FLOW_SETUP if scenario.without_gps else {})}
+        self.autopilot = AutopilotTwin(craft, clock, parameters, seed=seed)
         self.vehicle: FlyingVehicle = vehicle or self.autopilot
         self.radio = self.vehicle.radio
         self.teensy = TeensyTwin(_servo_truth(config), clock, seed)

@@ -90,13 +90,19 @@ def _global_position(autopilot: Autopilot) -> Message:
     )
 
 
+def _fix(autopilot: Autopilot) -> int:
+    if autopilot.table["GPS1_TYPE"] == 0:
+        return int(mavlink.GPS_FIX_TYPE_NO_GPS)
+    return int(mavlink.GPS_FIX_TYPE_RTK_FIXED if autopilot.estimator.aided else mavlink.GPS_FIX_TYPE_NO_FIX)
+
+
 def _gps_raw(autopilot: Autopilot) -> Message:
     fitted = autopilot.table["GPS1_TYPE"] != 0
     lat, lon = _lat_lon_e7(autopilot) if fitted else (0, 0)
     vn, ve, _ = autopilot.estimate.v_ned_m_s
     return mavlink.MAVLink_gps_raw_int_message(
         autopilot.t_ns // 1000,
-        6 if fitted else 0,
+        _fix(autopilot),
         lat,
         lon,
         round((HOME_ALT_M - autopilot.estimate.p_ned_m[2]) * 1e3) if fitted else 0,
@@ -111,10 +117,11 @@ def _gps_raw(autopilot: Autopilot) -> Message:
 def _sys_status(autopilot: Autopilot) -> Message:
     flow_only = autopilot.table.flow_only
     aiding = mavlink.MAV_SYS_STATUS_SENSOR_OPTICAL_FLOW if flow_only else mavlink.MAV_SYS_STATUS_SENSOR_GPS
+    delivers = autopilot.estimator.aided or not flow_only  # a GPS receiver without a fix counts as healthy
     present = _SENSORS | _RC_HEALTH | aiding | mavlink.MAV_SYS_STATUS_PREARM_CHECK
     health = _SENSORS
     health |= _RC_HEALTH if autopilot.rc.ever_seen and not autopilot.rc.failsafe else 0
-    health |= aiding if autopilot.estimator.has_position else 0
+    health |= aiding if delivers else 0
     health |= mavlink.MAV_SYS_STATUS_PREARM_CHECK if autopilot.ready_to_arm else 0
     battery = autopilot.battery
     return mavlink.MAVLink_sys_status_message(

@@ -44,11 +44,23 @@ _WITH_GPS = (
 _COASTING = _COMMON | Ekf.VELOCITY_HORIZ | Ekf.POS_VERT_AGL
 _WITH_FLOW = _COMMON | Ekf.VELOCITY_HORIZ | Ekf.POS_HORIZ_REL | Ekf.POS_VERT_AGL | Ekf.PRED_POS_HORIZ_REL
 
-_AIDING_TIMEOUT_NS = round(0.9 * S)
-"""How long the EKF coasts without aiding; with the failsafe's ten counts at 10 Hz this gives the measured 1.9 s."""
 
-_DEAD_RECKONING_NS = 5 * S
-"""How long velocity and position go on to be reported after the aiding is lost."""
+@dataclass(frozen=True, slots=True)
+class Coasting:
+    """What the autopilot says, and when, after the aiding is lost.
+
+    `told_s`: the sensor counts as lost; `flags_s`: the EKF's flags say so, and ten counts of the failsafe at 10 Hz
+    later it lands; `reported_s`: until then velocity and position are reported.
+    """
+
+    told_s: float
+    flags_s: float
+    reported_s: float
+
+
+WITHOUT_FLOW = Coasting(told_s=0.5, flags_s=0.9, reported_s=5.0)
+WITHOUT_GPS = Coasting(told_s=0.0, flags_s=7.6, reported_s=16.8)
+"""As ArduCopter 4.7 does in its own simulator."""
 
 _UNAIDED_M_S_SQRT_S = 0.1
 """How fast the velocity estimate walks away without aiding."""
@@ -148,8 +160,17 @@ class Estimator:
     def _warm(self) -> bool:
         return self._t_ns - self._boot_ns >= self._ready_after_ns
 
-    def _lost_for(self, time_ns: int) -> bool:
-        return self._aiding_lost_ns is not None and self._t_ns - self._aiding_lost_ns >= time_ns
+    @property
+    def _coasting(self) -> Coasting:
+        return WITHOUT_FLOW if self._table.flow_only else WITHOUT_GPS
+
+    def _lost_for(self, time_s: float) -> bool:
+        return self._aiding_lost_ns is not None and self._t_ns - self._aiding_lost_ns >= round(time_s * S)
+
+    @property
+    def aided(self) -> bool:
+        """The flow sensor, or GPS, is believed to deliver."""
+        return self._started() and not self._lost_for(self._coasting.told_s)
 
     def _started(self) -> bool:
         """The EKF has once been given all it needs."""
@@ -158,9 +179,9 @@ class Estimator:
     @property
     def flags(self) -> Ekf:
         """Return EKF_STATUS_REPORT.flags."""
-        if not self._started() or self._lost_for(_DEAD_RECKONING_NS):
+        if not self._started() or self._lost_for(self._coasting.reported_s):
             return _WAITING
-        if self._lost_for(_AIDING_TIMEOUT_NS):
+        if self._lost_for(self._coasting.flags_s):
             return _COASTING
         return _WITH_FLOW if self._table.flow_only else _WITH_GPS
 
@@ -172,7 +193,7 @@ class Estimator:
     @property
     def dead_reckons(self) -> bool:
         """Velocity and position are still reported and flown on, perhaps without aiding."""
-        return self._started() and not self._lost_for(_DEAD_RECKONING_NS)
+        return self._started() and not self._lost_for(self._coasting.reported_s)
 
     @property
     def healthy(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -107,7 +108,7 @@ def test_states_of_the_vehicle() -> None:
         assert found["battery-low"].severity is Severity.STOP
         assert "10%" in found["battery-low"].evidence
         assert "RC channel 7" in found["switch-on"].evidence
-        assert "no-position-yet" in found
+        assert "fix is of type 1" in found["no-position-yet"].evidence
 
     on_bench(story)
 
@@ -143,18 +144,21 @@ def test_slow_link_is_noticed() -> None:
 
 
 class Pilot:
-    """Does what the take-over test says, a moment later."""
+    """Does what the take-over test says, a moment later and in its order."""
 
     def __init__(self, bench: HubBench) -> None:
         self._bench = bench
         self.read: list[str] = []
+        self._heard: deque[str] = deque()
         self.obeys = 99
 
     def say(self, text: str) -> None:
         self.read.append(text)
-        asyncio.get_running_loop().call_later(0.7, self._act, text)
+        self._heard.append(text)
+        asyncio.get_running_loop().call_later(0.7, self._act)
 
-    def _act(self, text: str) -> None:
+    def _act(self) -> None:
+        text = self._heard.popleft()
         self.obeys -= 1
         if self.obeys < 0:
             return

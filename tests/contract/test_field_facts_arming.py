@@ -165,6 +165,39 @@ def test_flow_lost_in_flight_lands_after_1_9_seconds_and_drifts() -> None:
     assert drift_m == pytest.approx(4.0, rel=0.25), "about 4 m; the speed of the recording is not given"
 
 
+def test_flow_lost_is_told_half_a_second_later_and_a_lost_fix_at_once() -> None:
+    for setup, told, message_id, limit_s in (
+        (FLOW_SETUP, lambda m: not m.onboard_control_sensors_health & 0x40, mavlink.MAVLINK_MSG_ID_SYS_STATUS, 0.5),
+        ({}, lambda m: m.fix_type == 1, mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, 0.0),
+    ):
+        bench = AutopilotBench(dict(setup))
+        bench.take_off(3.0)
+        bench.station.stream(message_id, 50)
+        bench.wait(0.5)
+        name = mavlink.mavlink_map[message_id].msgname
+        assert not told(bench.station.heard[name][-1])
+        bench.twin.lose_flow()
+        start_ns = bench.clock.t_ns
+        while not told(bench.station.heard[name][-1]):
+            bench.hold(0.02, *NEUTRAL)
+            assert bench.clock.t_ns - start_ns < 2e9
+        assert (bench.clock.t_ns - start_ns) / 1e9 == pytest.approx(limit_s, abs=0.06)
+
+
+def test_gps_lost_in_flight_brakes_well_and_lands_after_8_6_seconds() -> None:
+    bench = AutopilotBench({"LOIT_SPEED": 500, "LOIT_BRK_DELAY": 0.2})
+    bench.take_off(3.0)
+    bench.forward(1330, 5.0)
+    bench.twin.lose_flow()
+    start_ns = bench.clock.t_ns
+    bench.hold(4.0, *NEUTRAL)
+    assert bench.speed_m_s < 0.6, "0.2 m/s on ArduCopter 4.7"
+    while bench.mode is not Mode.LAND:
+        bench.hold(0.02, *NEUTRAL)
+        assert bench.clock.t_ns - start_ns < 12e9
+    assert (bench.clock.t_ns - start_ns) / 1e9 == pytest.approx(8.6, rel=0.1)
+
+
 # Messages
 
 

@@ -15,12 +15,14 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import S, Ticker, running_clock
 from morpheyes_daemon.experiments.flight import FlightPlan
 from morpheyes_daemon.experiments.plan import make_plan
 from morpheyes_daemon.experiments.realtime import RealtimeFlight, fly_realtime, realtime_daemon
 from morpheyes_daemon.experiments.simulator_process import PilotAct
+from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import Action, State
 
@@ -120,3 +122,30 @@ async def test_a_daemon_cut_off_leaves_a_vehicle_that_stops_within_the_reserve(
             farthest_m = max(farthest_m, math.dist(now.p_ned_m[:2], before.p_ned_m[:2]))
         assert speed(flight) < 0.3
         assert farthest_m <= reserve_m + ESTIMATE_M
+
+
+@pytest.mark.parametrize("autopilot", [sitl])
+async def test_lost_aiding_is_braked_for_while_there_is_something_to_brake_on(
+    plan: FlightPlan, tmp_path: Path, autopilot: str
+) -> None:
+    async with cruising(plan, tmp_path, autopilot) as flight:
+        on_gps = flight.daemon.hub.parameters.values["GPS1_TYPE"] != 0
+        sensor = "SIM_GPS1_ENABLE" if on_gps else "SIM_FLOW_ENABLE"
+        before_m_s = speed(flight)
+        simulate_sensor(flight, sensor, on=False)
+        try:
+            await until(flight, lambda: flight.daemon.guardian.state is State.BRAKING, 2.0)
+            assert flight.daemon.guardian.reason is Reason.AIDING_LOST
+            await until(flight, lambda: flight.daemon.guardian.state is State.PILOT, 15.0)
+            print(f"{sensor}: {before_m_s:.2f} m/s before, {speed(flight):.2f} m/s left when the failsafe lands")
+            assert speed(flight) < 0.5
+        finally:
+            simulate_sensor(flight, sensor, on=True)
+
+
+def simulate_sensor(flight: RealtimeFlight, name: str, *, on: bool) -> None:
+    """Give SITL its sensor or take it away, over the daemon's own link."""
+    link = flight.daemon.hub.transmitter.link
+    assert link is not None
+    message = mavlink.MAVLink_param_set_message(1, 1, name.encode(), float(on), mavlink.MAV_PARAM_TYPE_INT8)
+    link.write(message.pack(mavlink.MAVLink(None, 255, 190)))

@@ -93,7 +93,11 @@ def test_lost_aiding_takes_the_flags_in_order() -> None:
     advance(vehicle, estimator, 0.1)
     assert estimator.flags & Ekf.POS_HORIZ_REL
     estimator.lose_aiding()
-    advance(vehicle, estimator, 0.8)
+    advance(vehicle, estimator, 0.45)
+    assert estimator.aided
+    advance(vehicle, estimator, 0.1)
+    assert not estimator.aided
+    advance(vehicle, estimator, 0.25)
     assert estimator.has_position
     advance(vehicle, estimator, 0.2)
     assert not estimator.has_position
@@ -104,6 +108,21 @@ def test_lost_aiding_takes_the_flags_in_order() -> None:
     assert not estimator.dead_reckons
     estimator.regain_aiding()
     assert estimator.has_position
+    assert estimator.aided
+
+
+def test_without_gps_the_ekf_goes_on_for_long() -> None:
+    vehicle, estimator = flying(EstimatorNoise())
+    advance(vehicle, estimator, 0.1)
+    assert estimator.aided
+    estimator.lose_aiding()
+    advance(vehicle, estimator, 0.01)
+    assert not estimator.aided
+    advance(vehicle, estimator, 7.5)
+    assert estimator.has_position
+    advance(vehicle, estimator, 0.2)
+    assert not estimator.has_position
+    assert estimator.dead_reckons
 
 
 def test_without_aiding_the_velocity_estimate_walks_away() -> None:

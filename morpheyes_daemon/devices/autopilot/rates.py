@@ -28,7 +28,8 @@ STREAMS = (
     Stream(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 50.0),
     Stream(dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR, 20.0),
     Stream(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT, 5.0),
-    Stream(dialect.MAVLINK_MSG_ID_SYS_STATUS, 2.0),
+    Stream(dialect.MAVLINK_MSG_ID_SYS_STATUS, 10.0),
+    Stream(dialect.MAVLINK_MSG_ID_GPS_RAW_INT, 5.0),
     Stream(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 2.0),
 )
 

@@ -34,7 +34,8 @@ class Telemetry:
             "RC_CHANNELS": self._rc,
             "DISTANCE_SENSOR": self._distance,
             "EKF_STATUS_REPORT": self._ekf,
-            "SYS_STATUS": self._battery,
+            "GPS_RAW_INT": self._gps,
+            "SYS_STATUS": self._status,
             "EXTENDED_SYS_STATE": self._landed,
         }
 
@@ -106,12 +107,17 @@ class Telemetry:
     def _ekf(self, message: Message, now_ns: int) -> dict[str, Any]:
         return {"ekf_t_ns": now_ns, "ekf_flags": message.flags}
 
-    def _battery(self, message: Message, now_ns: int) -> dict[str, Any]:
+    def _gps(self, message: Message, now_ns: int) -> dict[str, Any]:
+        return {"gps_fix": message.fix_type}
+
+    def _status(self, message: Message, now_ns: int) -> dict[str, Any]:
         known_v, known_share = message.voltage_battery != 65535, message.battery_remaining >= 0
         return {
             "battery_t_ns": now_ns,
             "battery_v": message.voltage_battery / 1000.0 if known_v else math.nan,
             "battery_fraction": message.battery_remaining / 100.0 if known_share else math.nan,
+            "sensors_present": message.onboard_control_sensors_present,
+            "sensors_health": message.onboard_control_sensors_health,
         }
 
     def _landed(self, message: Message, now_ns: int) -> dict[str, Any]:
