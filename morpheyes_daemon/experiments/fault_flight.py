@@ -215,7 +215,7 @@ class FaultFlight:
         reserved_m = self._reserved_m()
         states: list[State] = []
         self.topics.gate.tap(lambda out: states.append(out.state))
-        path = _Path(self.stage)
+        path = TruePath(self.stage)
         while self.clock.now_ns() - began_ns < seconds * S:
             path.sample(self.clock.now_ns())
             await self.sleep(SAMPLE_S)
@@ -263,7 +263,7 @@ def _quiet_s(sent: list[tuple[float, Sent]]) -> float | None:
     return after[0][0] if after else None
 
 
-class _Path:
+class TruePath:
     """The true way of the vehicle from where it is.
 
     What comes near counts in Loiter alone: in LAND or RTL nobody but the autopilot steers, and without a position it
@@ -291,4 +291,4 @@ class _Path:
             self.clearance_m = min(self.clearance_m, self._stage.clearance_m(t_ns))
 
 
-__all__ = ["AUTOPILOT_URL", "FaultFlight", "Measured", "Sent"]
+__all__ = ["AUTOPILOT_URL", "FaultFlight", "Measured", "Sent", "TruePath"]

@@ -6,17 +6,19 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.experiments.fault_endings import Ending, Fault, complaints
-from morpheyes_daemon.experiments.fault_flight import Measured, Sent
+from morpheyes_daemon.experiments.fault_flight import Measured, Sent, TruePath
 from morpheyes_daemon.experiments.fault_report import page
 from morpheyes_daemon.experiments.fault_run import Row, choose, flights, load_rows, make_row, store_row
 from morpheyes_daemon.experiments.faults import FAULTS
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.simulation.flight_modes import Mode
 
 PAGE = Path(__file__).parents[2] / "docs/faults.md"
 
@@ -164,3 +166,29 @@ def test_rows_are_kept_and_the_page_shows_the_worst(tmp_path: Path) -> None:
     rows.append(make_row(choose("camera-stall")[0], State.HOLD, 0, HELD, ("still moves",)))
     assert "3 flights (0 to 2 seeds each), 2 ended" in page(rows, "", (one,))
     assert "still moves" in page(rows, "", (one,))
+
+
+class Drifting:
+    """A stage whose vehicle comes 0.1 m nearer to a tree with each look, from 0.25 m on."""
+
+    def __init__(self) -> None:
+        self.autopilot = SimpleNamespace(autopilot=SimpleNamespace(mode=Mode.LOITER))
+        self.looks = 0
+
+    def truth(self, t_ns: int) -> SimpleNamespace:
+        return SimpleNamespace(p_ned_m=(0.0, 0.0, 0.0), v_ned_m_s=(0.0, 0.0, 0.0))
+
+    def clearance_m(self, t_ns: int) -> float:
+        self.looks += 1
+        return 0.35 - 0.1 * self.looks
+
+
+@pytest.mark.parametrize(("mode", "clearance_m"), [(Mode.LOITER, -0.05), (Mode.LAND, 0.15), (Mode.RTL, 0.15)])
+def test_what_comes_near_counts_in_loiter_alone(mode: Mode, clearance_m: float) -> None:
+    stage = Drifting()
+    path = TruePath(stage)  # type: ignore[arg-type]
+    for moment in range(4):
+        if moment == 2:
+            stage.autopilot.autopilot.mode = mode
+        path.sample(moment)
+    assert path.clearance_m == pytest.approx(clearance_m)
