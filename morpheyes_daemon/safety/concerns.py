@@ -37,10 +37,11 @@ def aided(vehicle: VehicleState) -> bool:
 
     The EKF coasts for 0.9 s without flow and for 7.6 s without GPS before its flags tell, and brakes well meanwhile.
     """
-    fixed = vehicle.gps_fix < 0 or vehicle.gps_fix >= FIX_3D
-    sources = OPTICAL_FLOW | VISION | (GPS if fixed else 0)
     fitted = vehicle.sensors_present & (GPS | OPTICAL_FLOW | VISION)
-    return not fitted or bool(fitted & vehicle.sensors_health & sources)
+    delivering = fitted & vehicle.sensors_health
+    if 0 <= vehicle.gps_fix < FIX_3D:
+        delivering &= ~GPS
+    return not fitted or bool(delivering)
 
 
 def concern(vehicle: VehicleState, now_ns: int, battery_low: float, gcs_timeout_s: float | None) -> Reason | None:
