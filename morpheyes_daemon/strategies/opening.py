@@ -166,11 +166,12 @@ def _candidates(found: Split, px_per_m: float) -> Iterator[tuple[Box, bool]]:
 
 def _largest(mask: Mask) -> Mask | None:
     """Return the largest piece of a mask."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=4)
+    count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=4)
     if count < 2:
         return None
-    label = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    return np.asarray(labels == label) if stats[label, cv2.CC_STAT_AREA] >= LEAST_PX else None
+    label = 1 if count == 2 else 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
+    piece = np.asarray(labels == label)
+    return piece if np.count_nonzero(piece) >= LEAST_PX else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

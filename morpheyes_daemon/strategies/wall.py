@@ -53,13 +53,17 @@ class Plane:
 
     def inverse_depth(self, rows: range, columns: range) -> FloatMap:
         """Return 1/Z over some rows and columns of the image."""
-        u = np.float32(self.a) * np.array(columns, dtype=np.float32) + np.float32(self.c)
-        v = np.float32(self.b) * np.array(rows, dtype=np.float32)
+        u = np.float32(self.a) * _floats(columns) + np.float32(self.c)
+        v = np.float32(self.b) * _floats(rows)
         return np.asarray(v[:, None] + u)
 
     def at(self, uv: Array) -> Array:
         """Return 1/Z (n,) at pixels (n, 2)."""
         return np.asarray(self.a * uv[:, 0] + self.b * uv[:, 1] + self.c)
+
+
+def _floats(indices: range) -> FloatMap:
+    return np.arange(indices.start, indices.stop, indices.step, dtype=np.float32)
 
 
 Box = tuple[slice, slice]
@@ -159,7 +163,8 @@ def _wall_plane(inverse: FloatMap, sigma_1_m: float) -> tuple[Plane, float] | No
     plane = candidates[int(np.argmax(np.count_nonzero(off < tolerance, axis=0)))]
     for _ in range(ROUNDS):
         on = np.abs(A @ plane - w) < tolerance
-        plane = np.linalg.solve(A[on].T @ A[on], A[on].T @ w[on])
+        A_on = A[on]
+        plane = np.linalg.solve(A_on.T @ A_on, A_on.T @ w[on])
     on = np.abs(A @ plane - w) < tolerance
     return Plane(*(float(x) for x in plane)), float(np.median(w[on]))
 
