@@ -40,8 +40,8 @@ def page(rows: list[Row], settings: str, faults: tuple[Fault, ...] = FAULTS) -> 
             " it takes to notice (*allowed* is the sum; for the pilot, 50 ms on top of his message's period). Class B:"
             " it is dead or cut off; the autopilot's time-out counts, and the vehicle must stop within what the"
             " governor had kept free at the moment of the fault. Times and distances are the worst over the seeds,"
-            " counted from the fault, in ENGAGED, where there is something to stop. Touching anything fails a row as long"
-            " as the autopilot is in Loiter. States and reasons: docs/safety.md.",
+            " counted from the fault, in ENGAGED, where there is something to stop. Touching anything fails a row while"
+            " the autopilot is in Loiter. States and reasons: docs/safety.md.",
             "",
             _line(_HEAD),
             _line(("---",) * len(_HEAD)),
