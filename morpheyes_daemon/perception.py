@@ -164,7 +164,7 @@ class Pipeline:
         if self._frozen.check(frame.left, frame.right):
             found.add(ImageFault.FROZEN)
         reasons = {_REASONS.get(fault, Reason.IMAGE_BAD) for fault in found}
-        if self._drift.broken:
+        if self._drift.broken or self._drift.late:
             reasons.add(Reason.EYES_APART)
         if self._still_scene and self._scale.check(Sight(pair.left, depth, motion)):
             reasons.add(Reason.DEPTH_SCALE)

@@ -55,6 +55,9 @@ class DriftLimits:
     """Time offset between the eyes that was declared."""
     late_change_s: float = 1e-3
     """How far the measured offset may be from it."""
+    late_largest_s: float = 4e-3
+    """An offset farther than this from the declared one makes depth worth nothing; in good flights it is 0.4 ms off,
+    1.4 ms where much of the scene moves."""
     yaw_pairs: int = 2
     """Pairs of frames, each of other seconds, that must agree before a yaw is called too large to be a drift."""
     steady_s: float = 0.5
@@ -120,7 +123,7 @@ class DriftMonitor:
         self._turned: Array = np.eye(3)
         self._told: set[Drift] = set()
         self._fit: RowFit | None = None
-        self._agreeing = 0
+        self._agreeing = self._late_frames = 0
         self._last_ns = 0
         self.broken = False
         """An eye has turned farther than any drift: depth is worth nothing until a new calibration."""
@@ -139,6 +142,7 @@ class DriftMonitor:
         f_px, nominal_m = depth.pinhole.f_px, pair.rectification.nominal_m
         rates = row_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, motion)
         self._fit = self._rows.add(offsets, depth.pinhole, *rates)
+        self._late_frames = self._late_frames + 1 if self._is_late(self._fit) else 0
         findings = [] if moving else self._judge_rows(offsets.median_px, f_px, nominal_m)
         steady = depth.t_ns - self._last_ns <= self.limits.steady_s * 1e9
         self._last_ns = depth.t_ns
@@ -151,6 +155,11 @@ class DriftMonitor:
         if report.rig_changed:
             self._forget()
         return report
+
+    @property
+    def late(self) -> bool:
+        """The eyes expose so far from when they should that depth is worth nothing, frame after frame."""
+        return self._late_frames >= self.limits.frames
 
     def knows(self, depth: DepthMap) -> bool:
         """Return whether the baseline of a frame is known well enough for its rows to mean anything."""
@@ -216,11 +225,18 @@ class DriftMonitor:
         text = f"the right eye has turned by {math.degrees(yaw):+.3f} deg in yaw ({yaw * f_px:+.2f} px of disparity)"
         return self._turn(Drift.YAW, np.array([0.0, yaw, 0.0]), nominal_m, text)
 
+    def _late_off_s(self, fit: RowFit) -> float:
+        return abs(abs(fit.late_s) - self.limits.late_s)
+
+    def _is_late(self, fit: RowFit) -> bool:
+        least_s = max(self.limits.late_largest_s, self.limits.strong_sigmas * fit.late_sigma_s)
+        return self._late_off_s(fit) > least_s
+
     def _judge_late(self) -> list[DriftFinding]:
         fit, limits = self._fit, self.limits
         if fit is None or fit.late_sigma_s > SHARP_S or self._agreeing:
             return []
-        off_s = abs(abs(fit.late_s) - limits.late_s)
+        off_s = self._late_off_s(fit)
         if off_s < limits.late_change_s + 3.0 * fit.late_sigma_s:
             return []
         text = f"the right eye exposes {fit.late_s * 1e3:.1f} ms late, not {limits.late_s * 1e3:.1f} ms as declared"

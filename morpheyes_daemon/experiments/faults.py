@@ -17,9 +17,8 @@ from morpheyes_daemon.simulation.teensy_twin import ServoFault
 FRAME_S, DEPTH_S, LINK_S, VEHICLE_S, SWITCH_S = 0.6, 0.7, 0.5, 0.3, 0.5
 """Declared times to notice: three camera periods, the same and the matcher's latency, and the time-outs."""
 
-APART_S, TURN_S, SCALE_S, REBOOT_S = 3.0, 6.0, 4.5, 0.8
-"""Eight frames that turn or pitch; the same when straight flight hides a smaller offset for a while; the servos' way
-to where depth is a third too large, five frames and latency; the Teensy's boot and its next STATUS."""
+APART_S, SCALE_S, REBOOT_S = 3.0, 4.5, 0.8
+"""Eight frames that turn or pitch, or the way on which the time between the eyes shows; the servos' way to where depth is a third too large, five frames and latency; the Teensy's boot and its next STATUS."""
 
 GPS_S, FLOW_S = 0.3, 0.7
 """The period in which the fix is told; the autopilot calls the flow lost after 0.5 s, and tells ten times a second."""
@@ -93,7 +92,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault("image-burnt", "exposure burnt out", DEPTH_S + PICTURE_S, _STOPPED, acts.burn_out),
     Fault("desync-5ms", "the right eye 5 ms late", 0.0, _PERHAPS, acts.desynchronize(5.0)),
-    Fault("desync-20ms", "the right eye 20 ms late", TURN_S, _SEEN_IN_MOTION, acts.desynchronize(20.0), watch_s=14.0),
+    Fault("desync-20ms", "the right eye 20 ms late", APART_S, _SEEN_IN_MOTION, acts.desynchronize(20.0), watch_s=11.0),
     Fault("desync-50ms", "the right eye 50 ms late", APART_S, _SEEN_IN_MOTION, acts.desynchronize(50.0), watch_s=11.0),
     # depth
     Fault("depth-slow", "each depth map 1 s late", DEPTH_S, _STOPPED, acts.slow_worker),

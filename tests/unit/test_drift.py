@@ -1,6 +1,7 @@
 """The drift watch: a turned rig is what it says, strong evidence is needed, and nothing is done without texture."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morpheyes_daemon.calibration.drift import Drift, DriftMonitor, rows_apart_rad, turned_rig
-from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates
+from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates, row_rates
 from morpheyes_daemon.calibration.rectified import StereoGeometry, infinity_px
 from morpheyes_daemon.calibration.yaw_watch import leverage
 from morpheyes_daemon.messages import BaselineEstimate, Pinhole, StereoFrame
@@ -92,6 +93,26 @@ def watched(pitch_deg: float, panels: list[Panel], frames: int, moving: bool = F
     still = EyeMotion.still(np.eye(4))
     reports = [monitor.update(pair, depth, offsets, moving, still) for _ in range(frames)]
     return monitor, [finding.what for report in reports for finding in report.findings]
+
+
+@pytest.mark.parametrize(("late_ms", "frames", "late"), [(2.0, 9, False), (5.0, 9, False), (7.0, 2, False),
+                                                          (7.0, 3, True), (20.0, 3, True)])  # fmt: skip
+def test_eyes_that_expose_far_from_when_they_should_end_trust_in_depth(
+    late_ms: float, frames: int, late: bool
+) -> None:
+    """Declared are 2 ms; the rows are moved as flying ahead at 3 m/s moves them in that time."""
+    monitor = DriftMonitor(SMALL)
+    estimator = DepthEstimator(SMALL)
+    frame = StereoFrame(0, 0, *raw_pair(WORLD, SMALL, 0.2, noise=1.5), BaselineEstimate(0, 0.2, 0.2, 1e-4, False))
+    pair = estimator.rectified(frame)
+    depth = estimator.depth(frame, pair)
+    ahead = EyeMotion(np.eye(4), np.array([0.0, 0.0, 3.0]), np.zeros(3))
+    offsets = row_offsets(pair.left, pair.right, disparity_of(depth))
+    by_travel, _ = row_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, ahead)
+    offsets = replace(offsets, dv_px=offsets.dv_px + late_ms / 1e3 * by_travel)
+    for _ in range(frames):
+        monitor.update(pair, depth, offsets, False, ahead)
+    assert monitor.late is late
 
 
 def test_a_pitched_eye_is_told_at_once_and_corrected_ten_frames_later() -> None:
