@@ -284,17 +284,22 @@ def starve(flight: FaultFlight) -> None:
 
 def fill_disk(flight: FaultFlight) -> None:
     """The log cannot grow by a byte."""
-    size = flight.recorder.path.stat().st_size
+    size = max(os.fstat(descriptor).st_size for descriptor in _open_log(flight))
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
 
 def remove_log_device(flight: FaultFlight) -> None:
-    """The log's file and folder go away under the recorder."""
-    path = flight.recorder.path
-    for descriptor in os.listdir("/proc/self/fd"):
-        if os.path.realpath(f"/proc/self/fd/{descriptor}") == str(path.resolve()):
-            os.close(int(descriptor))
-    path.unlink()
+    """The log's file goes away under the recorder."""
+    for descriptor in _open_log(flight):
+        os.close(descriptor)
+    flight.recorder.path.unlink()
+
+
+def _open_log(flight: FaultFlight) -> list[int]:
+    """Return the descriptors of the log; another branch of the flight may have unlinked it."""
+    path = str(flight.recorder.path.resolve())
+    names = {int(name): os.path.realpath(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd")}
+    return [descriptor for descriptor, name in names.items() if name.removesuffix(" (deleted)") == path]
 
 
 def step_wall_clock(flight: FaultFlight) -> None:

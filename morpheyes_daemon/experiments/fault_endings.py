@@ -49,9 +49,9 @@ class Ending(StrEnum):
 class Fault:
     """One row: `begin` breaks something, `end` mends it after `lasts_s`. `notice_s` is the declared detection time.
 
-    `watch_s` is how long to look on; `falls`: the motors stop, so that hitting something says nothing. `rig_seed`
-    flies another rig than the one that was calibrated, None the calibration missing; `without_gps` flies on optical
-    flow.
+    `watch_s` is how long to look on; what is not ENGAGED `settles` sooner. `falls`: the motors stop, so
+    that hitting something says nothing. `rig_seed` flies another rig than the one that was calibrated, None the
+    calibration missing; `without_gps` flies on optical flow.
     """
 
     name: str
@@ -62,13 +62,14 @@ class Fault:
     end: acts.Act = lambda flight: None
     lasts_s: float | None = None
     watch_s: float = 7.0
+    settles: bool = True
     falls: bool = False
     rig_seed: int | None = 0
     without_gps: bool = False
 
     def watched_s(self, state: State) -> float:
         """How long to look on: less where nothing moves that would have to stop."""
-        if state is State.ENGAGED:
+        if state is State.ENGAGED or not self.settles:
             return self.watch_s
         return min(self.watch_s, self.notice_s + (self.lasts_s or 0.0) + SETTLED_S[state])
 

@@ -18,7 +18,8 @@ FRAME_S, DEPTH_S, LINK_S, VEHICLE_S, SWITCH_S = 0.6, 0.7, 0.5, 0.3, 0.5
 """Declared times to notice: three camera periods, the same and the matcher's latency, and the time-outs."""
 
 APART_S, SCALE_S, REBOOT_S = 3.0, 4.5, 0.8
-"""Eight frames that turn or pitch, or the way on which the time between the eyes shows; the servos' way to where depth is a third too large, five frames and latency; the Teensy's boot and its next STATUS."""
+"""Eight frames that turn or pitch, or the way on which the time between the eyes shows; the servos' way to where
+depth is a third too large, five frames and latency; the Teensy's boot and its next STATUS."""
 
 GPS_S, FLOW_S = 0.3, 0.7
 """The period in which the fix is told; the autopilot calls the flow lost after 0.5 s, and tells ten times a second."""
@@ -43,7 +44,6 @@ _HARMLESS = _row(E.FLIES, E.RESUMES, E.HOLDS, E.READY)
 _PATCHY = _row(E.FLIES_WITH_PAUSES, E.FLIES_WITH_PAUSES, E.HOLDS, E.READY)
 _TAKEN = _row(E.RELEASES, E.RELEASES, E.RELEASES, None)
 _LEFT = _row(E.LETS_GO, E.LETS_GO, E.LETS_GO, E.UNREADY)
-_LEFT_LATE = _row(E.LETS_GO, E.HOLDS, E.HOLDS, E.UNREADY)
 _PERHAPS = _row(E.HOLDS_IF_IT_MATTERS, E.HOLDS_IF_IT_MATTERS, E.HOLDS, None)
 _SEEN_IN_MOTION = _row(E.HOLDS, E.HOLDS, E.HOLDS, None)
 _DEAD = _row(E.STOPS, E.STOPS, E.STOPS, E.UNREADY)
@@ -219,7 +219,7 @@ FAULTS: tuple[Fault, ...] = (
         _row(E.RELEASES, E.RELEASES, E.RELEASES, E.UNREADY),
         acts.upset_ekf,
     ),
-    Fault("gps-lost", "GPS is lost", GPS_S, _LEFT_LATE, acts.lose_aiding, watch_s=12.0),
+    Fault("gps-lost", "GPS is lost", GPS_S, _LEFT, acts.lose_aiding, watch_s=12.0, settles=False),
     Fault("flow-lost", "optical flow is lost", FLOW_S, _LEFT, acts.lose_aiding, watch_s=12.0, without_gps=True),
     Fault("battery-low", "10 % of charge left", STATUS_S, _STOPPED, acts.drain_battery),
     Fault(
