@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from morpheyes_daemon.cli.experiment import table
 from morpheyes_daemon.errors import InputError, UsageError
 from morpheyes_daemon.experiments import campaign as campaigns
 from morpheyes_daemon.experiments.campaign import FLIGHTS, Campaign, Row, cells, parse_seeds, run_campaign, wilson
@@ -115,3 +116,28 @@ def test_a_cell_says_why_flights_failed() -> None:
     (cell,) = cells(rows)
     assert (cell["flights"], cell["reached"], cell["collided"]) == (3, 1, 1)
     assert cell["causes"] == {"collided in seed 1: bar": 1, "aborted: depth_stale": 1}
+
+
+def test_baselines_are_compared_by_the_flights_of_the_same_seed() -> None:
+    rows = [
+        {
+            "baseline_mode": mode,
+            "seed": seed,
+            "outcome": outcome,
+            "reason": "goal_reached" if outcome == "reached" else "blind",
+            "mean_speed_m_s": speed,
+            "peak_speed_m_s": 4.0,
+            "time_s": 25.0,
+            "min_clearance_m": 0.3,
+            "braking_events": 0,
+        }
+        for mode, seed, outcome, speed in [
+            ("variable", 0, "reached", 3.0), ("variable", 1, "reached", 2.0), ("variable", 2, "timeout", 1.0),
+            ("0.1", 0, "reached", 1.5), ("0.1", 1, "reached", 1.0), ("0.1", 2, "reached", 3.0),
+            ("0.3", 0, "timeout", 0.1),
+        ]
+    ]  # fmt: skip
+    lines = table(cells(rows)).splitlines()
+    assert lines[0].endswith("| variable faster (95 %) |")
+    assert [line.split("|")[-2].strip() for line in lines[2:5]] == ["–", "2.00× (2.00 to 2.00)", "–"]
+    assert "variable faster" not in table(cells(rows[:3]))
