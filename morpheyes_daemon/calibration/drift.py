@@ -56,8 +56,8 @@ class DriftLimits:
     late_change_s: float = 1e-3
     """How far the measured offset may be from it."""
     late_largest_s: float = 4e-3
-    """An offset farther than this from the declared one makes depth worth nothing; in good flights it is 0.4 ms off,
-    1.4 ms where much of the scene moves."""
+    """An offset farther than this from the declared one makes depth worth nothing; it is measured to half a
+    millisecond."""
     yaw_pairs: int = 2
     """Pairs of frames, each of other seconds, that must agree before a yaw is called too large to be a drift."""
     steady_s: float = 0.5

@@ -19,7 +19,7 @@ from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.doctor.parameter_rules import examine_parameters
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages import Event, VehicleState
-from morpheyes_daemon.safety.concerns import GPS, aided
+from morpheyes_daemon.safety.concerns import GPS, aided, ekf_healthy
 from morpheyes_daemon.wire.mavlink import dialect
 
 LINK_S, PARAMETERS_S = 8.0, 60.0
@@ -27,7 +27,6 @@ LINK_S, PARAMETERS_S = 8.0, 60.0
 FIRST_STREAM_S, LISTEN_S = 3.0, 3.0
 SLOWEST_HZ = {"attitude_t_ns": 40.0, "rc_t_ns": 10.0, "heartbeat_t_ns": 8.0}
 PRE_ARM = "PreArm: "
-EKF_VELOCITY, EKF_RELATIVE, EKF_ABSOLUTE, EKF_CONSTANT_POSITION = 0x02, 0x08, 0x10, 0x80
 
 
 class VehicleExamination:
@@ -167,7 +166,7 @@ class VehicleExamination:
             findings.append(_finding("battery-low", Severity.STOP,
                                      f"{state.battery_fraction:.0%} left, {state.battery_v:.1f} V",
                                      "the battery failsafe takes the flight over", "change the battery"))  # fmt: skip
-        if not (_has_position(state.ekf_flags) and aided(state)):
+        if not (ekf_healthy(state) and aided(state)):
             fix = f", the GPS fix is of type {state.gps_fix}" if state.sensors_present & GPS else ""
             findings.append(_finding("no-position-yet", Severity.CARE, f"EKF flags are {state.ekf_flags:#x}{fix}",
                                      "Loiter cannot be entered",
@@ -198,11 +197,6 @@ _CALIBRATIONS = (
     "is_accelerometer_calibration_ok",
     "is_magnetometer_calibration_ok",
 )
-
-
-def _has_position(flags: int) -> bool:
-    moving = flags & EKF_VELOCITY and flags & (EKF_RELATIVE | EKF_ABSOLUTE)
-    return bool(moving) and not flags & EKF_CONSTANT_POSITION
 
 
 def _finding(name: str, severity: Severity, evidence: str, risk: str, remedy: str) -> Finding:

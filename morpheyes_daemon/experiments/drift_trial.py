@@ -65,11 +65,12 @@ class DriftTrial:
 
 @dataclass(frozen=True, slots=True)
 class LateTrial:
-    """A time between the eyes, and what was measured of it in flight (one sigma)."""
+    """A time between the eyes, what was measured of it in flight (one sigma), and whether it ends trust in depth."""
 
     true_ms: float
     measured_ms: float
     sigma_ms: float
+    ends_trust: bool
 
 
 class _Watched:
@@ -144,7 +145,8 @@ def late_trials(rig: RigModel, seed: int, progress: Progress = silent) -> Iterat
         for number in range(FRAMES):
             t_ns = round(number * S / _RATE_HZ)
             report = watched.look(number, t_ns, _PLACES_M[1], flight.T_ned_frd, flight.reported(t_ns))
-        yield LateTrial(late_s * 1e3, round(report.late_s * 1e3, 3), round(report.late_sigma_s * 1e3, 3))
+        measured_ms, sigma_ms = round(report.late_s * 1e3, 3), round(report.late_sigma_s * 1e3, 3)
+        yield LateTrial(late_s * 1e3, measured_ms, sigma_ms, watched.monitor.late)
 
 
 class _Flight:

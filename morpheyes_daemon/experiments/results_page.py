@@ -38,11 +38,7 @@ PAPER = {
 WHY = {
     "forest": (
         "Differences: our fixed baselines run under the same speed governor as the variable one, so a baseline that "
-        "sees badly makes the vehicle slow or stop, not crash; the paper held the speed and counted crashes. Nor is "
-        "any of them slower here; 0.2 m held is even a twentieth faster than the variable one, which is still to be "
-        "understood. Even 0.3 m at 64 disparities, blind nearer than 3.5 m, is not slower: what is so near shows as "
-        "near at the disparity's ceiling, and what was seen from farther away is remembered. In a forest the variable "
-        "baseline is not what decides; before the moving object, below, it is."
+        "sees badly makes the vehicle slow or stop, not crash; the paper held the speed and counted crashes."
     ),
     "gap": (
         "Every opening is just large enough for the silhouette at a lean of 12° and 40 mm on every side; `small` ones "

@@ -133,13 +133,18 @@ async def test_lost_aiding_is_braked_for_while_there_is_something_to_brake_on(
         sensor = "SIM_GPS1_ENABLE" if on_gps else "SIM_FLOW_ENABLE"
         await until(flight, lambda: speed(flight) > FAST_M_S)
         before_m_s = speed(flight)
+        clock = running_clock()
+        lost_ns = clock.now_ns()
         simulate_sensor(flight, sensor, on=False)
         try:
             await until(flight, lambda: flight.daemon.guardian.state is State.BRAKING, 2.0)
+            braking_s = (clock.now_ns() - lost_ns) / S
             assert flight.daemon.guardian.reason is Reason.AIDING_LOST
             await until(flight, lambda: flight.daemon.guardian.state is State.PILOT, 15.0)
-            print(f"{sensor}: {before_m_s:.2f} m/s before, {speed(flight):.2f} m/s left when the failsafe lands")
-            assert speed(flight) < before_m_s / 2.0
+            failsafe_s, left_m_s = (clock.now_ns() - lost_ns) / S, speed(flight)
+            print(f"{sensor}: brakes after {braking_s:.2f} s from {before_m_s:.2f} m/s,", end=" ")
+            print(f"failsafe after {failsafe_s:.2f} s at {left_m_s:.2f} m/s")
+            assert left_m_s < before_m_s / 2.0
         finally:
             simulate_sensor(flight, sensor, on=True)
 

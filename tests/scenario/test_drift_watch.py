@@ -26,3 +26,4 @@ def test_a_good_rig_is_left_alone() -> None:
 def test_the_time_between_the_eyes_is_measured_from_the_images() -> None:
     for trial in late_trials(RigTwin(640, 480, seed=0).exact_rig(), seed=0):
         assert trial.measured_ms == pytest.approx(trial.true_ms, abs=0.5)
+        assert trial.ends_trust == (trial.true_ms > 6.0), "2 ms are declared, 4 more allowed"

@@ -88,41 +88,35 @@ def test_the_same_seed_gives_the_same_errors() -> None:
     assert runs[0] != runs[2]
 
 
-def test_lost_aiding_takes_the_flags_in_order() -> None:
-    vehicle, estimator = flying(EstimatorNoise(), **FLOW_SETUP)
+@pytest.mark.parametrize(
+    ("setup", "told_s", "flags_s", "reported_s"),
+    [pytest.param(FLOW_SETUP, 0.5, 0.9, 5.0, id="flow"), pytest.param({}, 0.0, 7.6, 16.8, id="gps")],
+)
+def test_lost_aiding_is_told_in_order(
+    setup: dict[str, float], told_s: float, flags_s: float, reported_s: float
+) -> None:
+    vehicle, estimator = flying(EstimatorNoise(), **setup)
     advance(vehicle, estimator, 0.1)
     assert estimator.flags & Ekf.POS_HORIZ_REL
     estimator.lose_aiding()
-    advance(vehicle, estimator, 0.45)
-    assert estimator.aided
-    advance(vehicle, estimator, 0.1)
-    assert not estimator.aided
-    advance(vehicle, estimator, 0.25)
-    assert estimator.has_position
-    advance(vehicle, estimator, 0.2)
-    assert not estimator.has_position
-    assert estimator.dead_reckons
-    assert not estimator.flags & Ekf.CONST_POS_MODE
-    advance(vehicle, estimator, 4.5)
-    assert estimator.flags & Ekf.CONST_POS_MODE
-    assert not estimator.dead_reckons
+    lost_s = 0.0
+    for moment_s, signs in [
+        (told_s - 0.05, (True, True, True)),
+        (told_s + 0.05, (False, True, True)),
+        (flags_s - 0.05, (False, True, True)),
+        (flags_s + 0.05, (False, False, True)),
+        (reported_s - 0.05, (False, False, True)),
+        (reported_s + 0.05, (False, False, False)),
+    ]:
+        if moment_s < 0.0:
+            continue
+        advance(vehicle, estimator, moment_s - lost_s)
+        lost_s = moment_s
+        assert (estimator.aided, estimator.has_position, estimator.dead_reckons) == signs
+        assert bool(estimator.flags & Ekf.CONST_POS_MODE) == (not signs[2])
     estimator.regain_aiding()
     assert estimator.has_position
     assert estimator.aided
-
-
-def test_without_gps_the_ekf_goes_on_for_long() -> None:
-    vehicle, estimator = flying(EstimatorNoise())
-    advance(vehicle, estimator, 0.1)
-    assert estimator.aided
-    estimator.lose_aiding()
-    advance(vehicle, estimator, 0.01)
-    assert not estimator.aided
-    advance(vehicle, estimator, 7.5)
-    assert estimator.has_position
-    advance(vehicle, estimator, 0.2)
-    assert not estimator.has_position
-    assert estimator.dead_reckons
 
 
 def test_without_aiding_the_velocity_estimate_walks_away() -> None:
