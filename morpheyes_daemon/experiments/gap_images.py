@@ -128,7 +128,8 @@ def largest_hole(inverse: FloatMap) -> tuple[Mask, float, bool]:
     for _ in range(2):
         filtered = cv2.bilateralFilter(smooth, SMOOTH_PX, 0.3 * float(np.median(smooth)), SMOOTH_PX)
         smooth = np.asarray(filtered, dtype=np.float32)
-    found = split_inverse(smooth, np.zeros(smooth.shape, np.bool_), FLOW_SIGMA * float(np.median(np.abs(smooth))))
+    sigma = FLOW_SIGMA * float(np.median(np.abs(smooth)))
+    found = split_inverse(smooth.__getitem__, np.zeros(smooth.shape, np.bool_), sigma)
     if found is None:
         return np.zeros(smooth.shape, np.bool_), 0.0, False
     return enclosed(found.clusters()[0]), found.separation, found.bimodal

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from morpheyes_daemon.messages import DepthMap, FloatMap, Pinhole
-from morpheyes_daemon.strategies.wall import Box, Mask, Plane, Split
+from morpheyes_daemon.strategies.wall import Box, Mask, Plane, Split, median
 from morpheyes_daemon.transforms import Array
 
 CELLS = 160
@@ -119,8 +118,8 @@ def passage(plane: Plane, pinhole: Pinhole, T_ned_rect: Array) -> Passage | None
     if size < 0.5 * float(np.linalg.norm(normal)) or normal[2] <= 0.0:
         return None
     along = np.array([ned[0] / size, ned[1] / size, 0.0])
-    down = np.array([0.0, 0.0, 1.0])
-    axes = R.T @ np.stack([np.cross(down, along), down, along], axis=1)
+    to_the_right, down = np.array([-along[1], along[0], 0.0]), np.array([0.0, 0.0, 1.0])
+    axes = R.T @ np.stack([to_the_right, down, along], axis=1)
     K = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
     right, below, ahead = axes.T
     share = 1.0 / float(normal @ ahead)
@@ -189,7 +188,7 @@ def _opening(depth: DepthMap, way: Passage, silhouette: Silhouette, hole: _Hole)
     corner = np.array([hole.box[1].start, hole.box[0].start], dtype=np.float32)
     outlines, _ = cv2.findContours(hole.inside.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     contour = max(outlines, key=len)[:, 0].astype(np.float32) + corner
-    z_m = float(np.median(1.0 / np.maximum(way.plane.at(contour.astype(np.float64)), 1e-3)))
+    z_m = median(1.0 / np.maximum(way.plane.at(contour.astype(np.float64)), 1e-3))
     raster = _raster(hole.inside, contour, corner, way, silhouette)
     band_px = max(2, round(BAND_M * depth.pinhole.f_px / max(way.range_m, 0.2)))
     u, v = (float(c) for c in _safest_px(hole, band_px) + corner)
@@ -224,12 +223,12 @@ def _safest_px(hole: _Hole, band_px: int) -> FloatMap:
     kernel = np.ones((2 * band_px + 1, 2 * band_px + 1), np.uint8)
     band = cv2.dilate(hole.inside.view(np.uint8), kernel).view(np.bool_) & hole.wall
     chosen = band if np.count_nonzero(band) >= np.count_nonzero(hole.far) else hole.far
-    return np.array([_median_index(chosen.sum(axis=0)), _median_index(chosen.sum(axis=1))], dtype=np.float32)
+    return np.array([_median_index(chosen, axis) for axis in (0, 1)], dtype=np.float32)
 
 
-def _median_index(counts: NDArray[np.int64]) -> float:
-    """Return the median of indices that occur so often."""
-    total = np.cumsum(counts)
+def _median_index(mask: Mask, axis: int) -> float:
+    """Return the median column (axis 0) or row (axis 1) of a mask's pixels."""
+    total = np.cumsum(cv2.reduce(mask.view(np.uint8), axis, cv2.REDUCE_SUM, dtype=cv2.CV_32S))
     return float(np.searchsorted(total, total[-1] / 2))
 
 
