@@ -45,6 +45,9 @@ class FixedBaseline:
     def command(self, target_m: float, t_ns: int) -> None:
         """Do nothing: the rig cannot move."""
 
+    def send(self, target_m: float, t_ns: int) -> None:
+        """Do nothing: the rig cannot move."""
+
     def doubt(self, target_m: float, t_ns: int) -> None:
         """Do nothing: the rig cannot move."""
 
@@ -74,6 +77,11 @@ class BaselineModel:
         """Take note that the servo acknowledged `target_m` at `t_ns`; times must not go back."""
         hull = target_m, target_m
         self._note(_Command(target_m, t_ns, t_ns + self._earliest_ns, t_ns + self._latest_ns, hull))
+
+    def send(self, target_m: float, t_ns: int) -> None:
+        """Take note that `target_m` was sent at `t_ns`; until it is acknowledged the old target may hold as well."""
+        hull = target_m, target_m
+        self._note(_Command(target_m, t_ns, t_ns + self._earliest_ns, None, hull))
 
     def doubt(self, target_m: float, t_ns: int) -> None:
         """Take note that `target_m` was sent at `t_ns` but may have been lost, or the servo may have stopped.

@@ -3,7 +3,8 @@
 The servo slews by itself at its own speed, so a plan is a target, not a ramp. The planner ignores changes that would
 not pay, keeps the share of time in motion under the servo's duty limit in every window, and lets every motion end
 by shrinking, which takes the backlash out. It never spends on growing what coming back would cost: a large
-baseline that cannot shrink is blind to what is near.
+baseline that cannot shrink is blind to what is near. Each turn on the way adds to the doubt where the eyes are, and
+only rest takes it away: once in doubt, a motion inwards is finished before the next one outwards.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ OVERSHOOT_M = 0.001
 """Beyond the play (twice 0.25 mm), so that the last piece of a growing motion is a shrinking one."""
 LOST_M = 0.001
 """Doubt beyond backlash and repeatability, at rest, that is worth commanding the place again."""
+TURN_SIGMA_M = 0.003
+"""Doubt with which a shrinking baseline is not turned outwards again; one turn adds about as much."""
 WINDOW_NS = 300 * S
 """Duty of small actuators is rated over minutes, commonly 2 in 10 (motor heat); half of that to be careful."""
 
@@ -65,6 +68,8 @@ class BaselinePlanner:
         for to_m in (wanted_m, self._affordable(wanted_m, estimate)):
             if abs(to_m - self._aim_m()) < deadband_m:
                 return self._come_back(estimate)
+        if to_m > self._aim_m() and self._is_shrinking(estimate) and estimate.sigma_m > TURN_SIGMA_M:
+            return None
         return self._go(to_m, estimate)
 
     def duty(self, t_ns: int) -> float:
@@ -79,6 +84,10 @@ class BaselinePlanner:
 
     def _is_lost(self, estimate: BaselineEstimate) -> bool:
         return self._at_rest(estimate) and estimate.sigma_m > self._lost_sigma_m
+
+    def _is_shrinking(self, estimate: BaselineEstimate) -> bool:
+        assert self._target_m is not None
+        return not self._at_rest(estimate) and self._target_m < estimate.baseline_m
 
     def _at_rest(self, estimate: BaselineEstimate) -> bool:
         """Return whether the last motion is over, by plan and by model (which knows of it only after a latency)."""

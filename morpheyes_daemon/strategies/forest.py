@@ -42,7 +42,7 @@ class ForestParameters(StrategyParameters):
     goal_radius_m: float = Field(1.5, gt=0.2, le=20, description="the goal counts as reached within this")
     height_m: float | None = Field(None, gt=0.3, le=20, description="None: the height at which it engaged")
     speed_m_s: float = Field(4.0, gt=0.1, le=10, description="never wanted faster; the governor is the real bound")
-    baseline_gain: float = Field(0.04, gt=0, le=1, description="K of b = K Z_close")
+    baseline_gain: float = Field(0.02, gt=0, le=1, description="K of b = K Z_close")
     baseline_smoothing_s: float = Field(0.5, ge=0, le=10, description="time constant of the low-passed Z_close")
     margin_m: float = Field(0.30, ge=0, le=3, description="room kept to obstacles on each side")
     tight_margin_m: float = Field(0.15, ge=0, le=3, description="room kept where nothing wider is free")
@@ -329,7 +329,7 @@ class Forest(Strategy):
         return self._command(observation, intent, reason, (0.0, 0.0, 0.0), None, 0.0, self._z_close_m, {})
 
     def _follow(self, z_close_m: float, dt_s: float) -> None:
-        """Low-pass Z_close; it falls at once (the near blind zone is the danger) and rises slowly."""
+        """Low-pass Z_close, which the baseline follows."""
         smoothing = self.parameters.baseline_smoothing_s
         if math.isnan(self._z_close_m) or smoothing <= 0.0:
             self._z_close_m = z_close_m

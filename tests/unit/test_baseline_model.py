@@ -86,7 +86,7 @@ def test_an_acknowledgement_may_come_late_when_the_sending_was_noted(
     twin, model = twin_on(clock, seed), BaselineModel(MOTION)
     for wait_ms, target_m, answer_ms in commands:
         clock.t_ns += wait_ms * MS
-        model.doubt(target_m, clock.t_ns)
+        model.send(target_m, clock.t_ns)
         send(twin, target_m)
         clock.t_ns += answer_ms * MS
         model.command(target_m, clock.t_ns)
