@@ -25,7 +25,9 @@ def command(
     scheduler: Annotated[str | None, typer.Option(help="A running Dask scheduler, tcp://HOST:PORT.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder; a campaign found there is continued.")] = None,
     config: Annotated[Path | None, typer.Option(help="Vehicle configuration.")] = None,
-    calibration: Annotated[str, typer.Option(help="'solved', 'mounted', 'exact', or a calibration file.")] = "solved",
+    calibration: Annotated[
+        str | None, typer.Option(help="'solved', 'mounted' (usual for gaps), 'exact', or a calibration file.")
+    ] = None,
     world: Annotated[str | None, typer.Option(help="World by name or path, instead of the mission's own.")] = None,
     wind_m_s: Annotated[float, typer.Option(min=0.0, max=15.0, help="Mean wind, with its gusts.")] = 2.0,
     latency_ms: Annotated[float | None, typer.Option(min=0.0, help="Frame to depth in lockstep.")] = None,

@@ -30,9 +30,12 @@ def command(
         Path | None, typer.Option(help="Vehicle configuration; default: ./config.yaml or the shipped one.")
     ] = None,
     calibration: Annotated[
-        str,
-        typer.Option(help="'solved' from rendered boards, 'mounted': the eyes' mount measured too, 'exact', or a file."),
-    ] = "solved",
+        str | None,
+        typer.Option(
+            help="'solved' from rendered boards, 'mounted': the eyes' mount measured too (usual for gaps), 'exact', "
+            "or a file."
+        ),
+    ] = None,
     world: Annotated[str | None, typer.Option(help="World by name or path, instead of the mission's own.")] = None,
     wind_m_s: Annotated[float, typer.Option(min=0.0, max=15.0, help="Mean wind, with its gusts.")] = 2.0,
     latency_ms: Annotated[float | None, typer.Option(min=0.0, help="Frame to depth in lockstep.")] = None,

@@ -27,7 +27,7 @@ def make_plan(
     rate_hz: float = 5.0,
     size: str = "640x480",
     config: Path | None = None,
-    calibration: str = "solved",
+    calibration: str | None = None,
     world: str | None = None,
     wind_m_s: float = 2.0,
     latency_ms: float | None = None,
@@ -48,7 +48,7 @@ def make_plan(
     vehicle = vehicle.model_copy(update={"stereo": vehicle.stereo.model_copy(update=stereo)})
     place = world or file.world
     load_world(place)
-    path = calibration_file(calibration, progress)
+    path = calibration_file(calibration or usual_calibration(file.strategy), progress)
     fitting_rig(path, vehicle)
     return FlightPlan(
         mission_name=find_mission(mission).stem,
@@ -95,6 +95,11 @@ def parse_size(text: str) -> tuple[int, int]:
     if not (160 <= width <= 1920 and width * 3 == height * 4):
         raise UsageError(f"--size {text}: the simulated camera has 4:3 images from 160x120 to 1920x1440.")
     return width, height
+
+
+def usual_calibration(strategy: str) -> str:
+    """Return how the rig of a mission is calibrated unless said otherwise: with its mount where openings are tight."""
+    return "mounted" if strategy == "gap" else "solved"
 
 
 def calibration_file(kind: str, progress: Progress = silent) -> Path:

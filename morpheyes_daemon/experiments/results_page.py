@@ -13,7 +13,7 @@ from typing import Any
 from morpheyes_daemon.config import StereoConfig
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.experiments.campaign import SETTINGS, Row
-from morpheyes_daemon.experiments.plan import DISPARITIES_OF_PX
+from morpheyes_daemon.experiments.plan import DISPARITIES_OF_PX, usual_calibration
 from morpheyes_daemon.experiments.stage import WIND_M_S
 
 BEGIN = "<!-- missions: written by `morpheyes results` -->"
@@ -100,8 +100,9 @@ def _command(settings: Row) -> str:
     options += [f"--{key.replace('_', '-')} {settings[key]:g}" for key, value in usual.items() if settings[key] != value]
     if settings["disparities_fraction"] != StereoConfig().disparities_fraction:
         options.append(f"--disparities {_disparities(settings['disparities_fraction'])}")
-    if settings.get("calibration", "solved") != "solved":
-        options.append(f"--calibration {settings['calibration']}")
+    calibration = settings.get("calibration", "solved")
+    if calibration != usual_calibration(settings["strategy"]):
+        options.append(f"--calibration {calibration}")
     return " ".join([f"morpheyes experiment {settings['mission']}", *options, f"--world {settings['world']}"])
 
 

@@ -36,6 +36,18 @@ def test_every_campaign_is_told_with_its_command(tmp_path: Path) -> None:
     assert text.index("## Forest") < text.index("| slow |") < text.index("## Gap") < text.index("| gap |")
 
 
+@pytest.mark.parametrize(
+    ("strategy", "calibration", "said"),
+    [("forest", "solved", False), ("forest", "mounted", True), ("gap", "mounted", False), ("gap", "solved", True)],
+)
+def test_a_calibration_is_in_the_command_unless_it_is_the_usual_one(
+    tmp_path: Path, strategy: str, calibration: str, said: bool
+) -> None:
+    page = tmp_path / "results.md"
+    write_page([campaign(tmp_path / "a", strategy=strategy, calibration=calibration)], page)
+    assert (f"--calibration {calibration}" in page.read_text()) == said
+
+
 def test_the_rest_of_the_page_is_kept(tmp_path: Path) -> None:
     page = tmp_path / "results.md"
     page.write_text(f"# Results\n\nabove\n\n{BEGIN}\nold\n{END}\n\n## Safety\n\nbelow\n")
