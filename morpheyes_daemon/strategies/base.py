@@ -63,8 +63,9 @@ class View:
 class Observation:
     """What `decide` gets: the newest percept and the vehicle now and at exposure.
 
-    `reserve_m` is the distance the vehicle needs to stop from its present speed, the governor's reaction time
-    included; `engaged` tells whether the mission has the vehicle, braking for a gap in the inputs included.
+    `braking_m` is the distance the vehicle needs to stop from its present speed, `reserve_m` the same with the
+    governor's reaction time; `engaged` tells whether the mission has the vehicle, braking for a gap in the inputs
+    included.
     """
 
     now_ns: int
@@ -73,6 +74,7 @@ class Observation:
     vehicle: VehicleState
     at_exposure: VehicleState
     baseline_m: float
+    braking_m: float
     reserve_m: float
     engaged: bool
 

@@ -77,6 +77,10 @@ UNSEEN_M = 2.0
 """Where something is taken to stand in a direction of which nothing at all is known."""
 
 
+STEERED = 4
+"""So many twelfths of the time that is looked ahead pass before a command shows in the course."""
+
+
 class Phase(StrEnum):
     """What the decider is doing."""
 
@@ -251,7 +255,8 @@ class Forest(Strategy):
         facing = math.cos(min(math.pi / 2, 1.5 * abs(wrap_rad(heading - vehicle.yaw_rad))))
         wanted *= max(0.15, facing)
         way = np.array([math.cos(command_rad), math.sin(command_rad)])
-        wanted *= self._turnable(obstacles, np.array([vx, vy]), wanted * way, slim)
+        braking_s = min(observation.braking_m, reach) / max(speed, 1.0)
+        wanted *= self._turnable(obstacles, np.array([vx, vy]), wanted * way, slim, braking_s)
         self._heading_rad = heading
         self._follow(z_close, dt_s)
         return self._command(
@@ -271,19 +276,24 @@ class Forest(Strategy):
         off_rad = min(math.pi / 2, abs(wrap_rad(math.atan2(to_goal[1], to_goal[0]) - course_rad)))
         return rate_rad_s * math.hypot(*to_goal) / (2.0 * max(0.01, math.sin(off_rad)))
 
-    def _turnable(self, obstacles: Floats, v_m_s: Floats, wanted_m_s: Floats, half_width_m: float) -> float:
+    def _turnable(
+        self, obstacles: Floats, v_m_s: Floats, wanted_m_s: Floats, half_width_m: float, braking_s: float
+    ) -> float:
         """Return which share of the wanted velocity keeps clear on the way to the next decision.
 
         A velocity changes over a second, so the way to a new heading bends: with frames far apart it leaves the
-        corridors of both the old course and the new one.
+        corridors of both the old course and the new one, and points at what stands between them. It must be possible
+        to stop before that, too: `braking_s` is the braking distance over the speed.
         """
-        t = np.linspace(0.0, 1.0, 12) * 2.0 * self.craft.frame_period_s
-        gone = RESPONSE_S * (1.0 - np.exp(-t / RESPONSE_S))
+        t = np.linspace(0.0, 1.0, 12)[:, None] * 2.0 * self.craft.frame_period_s
+        kept = np.exp(-t / RESPONSE_S)
         best, best_room = 0.0, -math.inf
         for share in (1.0, 0.7, 0.45, 0.25, 0.0):
             v = share * wanted_m_s
-            path = np.outer(t, v) + np.outer(gone, v_m_s - v)
-            room = float(np.linalg.norm(obstacles[:, None, :] - path[None], axis=2).min(initial=math.inf))
+            path = t * v + RESPONSE_S * (1.0 - kept) * (v_m_s - v)
+            braking = braking_s * (v + kept * (v_m_s - v))
+            braking[:STEERED] = 0.0
+            room = _room_m(obstacles, path, braking)
             if room > half_width_m:
                 return share
             if room > best_room + 0.02:
@@ -369,6 +379,16 @@ class Forest(Strategy):
 def _right_is_freer(profile: ObstacleProfile) -> bool:
     left, right = np.array_split(np.minimum(profile.range_m, profile.trust_m), 2)
     return float(right.mean()) >= float(left.mean())
+
+
+def _room_m(obstacles: Floats, path: Floats, ways: Floats) -> float:
+    """Return how near any obstacle (N, 2) comes to the stretches (M, 2) that lead from a path (M, 2) by `ways`."""
+    if not len(obstacles):
+        return math.inf
+    off = obstacles[:, None, :] - path
+    length_2 = np.maximum((ways**2).sum(axis=1), 1e-12)
+    share = np.clip((off * ways).sum(axis=2) / length_2, 0.0, 1.0)
+    return float(np.linalg.norm(off - share[..., None] * ways, axis=2).min())
 
 
 def _wrapped(angle_rad: Floats) -> Floats:

@@ -41,6 +41,7 @@ def observe(
         vehicle=present,
         at_exposure=track.at(seen.summary.t_ns),
         baseline_m=seen.summary.baseline_m,
+        braking_m=stopping.stopping_distance_m(speed, height_m) if stopping else math.inf,
         reserve_m=stopping.stopping_distance_m(speed, height_m, reaction_s) if stopping else math.inf,
         engaged=guardian.state in (State.ENGAGED, State.BRAKING),
     )

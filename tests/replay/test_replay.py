@@ -80,7 +80,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         sighting = Sighting(points, math.inf if k % 7 == 0 else float(rng.uniform(1, 9)))
         topics.perception.publish(Perception(summary, sighting, np.full(72, math.nan, np.float32)))
         vehicles = [VehicleState(t_ns=clock.t_ns, p_ned_m=tuple(rng.normal(size=3).tolist())) for _ in range(2)]
-        observation = Observation(clock.t_ns, sighting, summary, vehicles[0], vehicles[1], 0.2, math.pi, True)
+        observation = Observation(clock.t_ns, sighting, summary, vehicles[0], vehicles[1], 0.2, 2.0, math.pi, True)
         topics.observation.publish(observation)
         topics.command.publish(strategy.decide(observation))
     recorder.close()

@@ -22,8 +22,10 @@ def forest(frame_period_s: float) -> Forest:
     return Forest(ForestParameters(goal=Goal()), craft)
 
 
-def share(frame_period_s: float, obstacles: np.ndarray, before: np.ndarray, wanted: np.ndarray) -> float:
-    return forest(frame_period_s)._turnable(obstacles, before, wanted, 0.4)
+def share(
+    frame_period_s: float, obstacles: np.ndarray, before: np.ndarray, wanted: np.ndarray, braking_s: float = 0.0
+) -> float:
+    return forest(frame_period_s)._turnable(obstacles, before, wanted, 0.4, braking_s)
 
 
 def nearest_m(frame_period_s: float, course_rad: float, speed_m_s: float) -> float:
@@ -49,9 +51,16 @@ def test_with_frames_close_together_the_next_one_is_in_time() -> None:
     assert share(0.2, TREE, AHEAD, ASIDE) == 1.0
 
 
+@pytest.mark.parametrize(("away_m", "slower"), [(2.5, True), (6.0, False)])
+def test_a_tree_between_two_courses_is_slowed_for_when_braking_would_end_in_it(away_m: float, slower: bool) -> None:
+    tree = away_m * np.array([[math.cos(0.4), math.sin(0.4)]])
+    assert share(0.2, tree, AHEAD, ASIDE) == 1.0
+    assert (share(0.2, tree, AHEAD, ASIDE, braking_s=1.1) < 1.0) == slower
+
+
 @pytest.mark.parametrize("obstacles", [np.empty((0, 2)), np.array([[9.0, -5.0]])], ids=["nothing", "far away"])
 def test_a_free_way_is_not_slowed(obstacles: np.ndarray) -> None:
-    assert share(1.0, obstacles, AHEAD, ASIDE) == 1.0
+    assert share(1.0, obstacles, AHEAD, ASIDE, braking_s=1.1) == 1.0
 
 
 @pytest.mark.parametrize("frame_period_s", [0.2, 1.0])

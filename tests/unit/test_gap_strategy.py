@@ -52,7 +52,7 @@ class Course:
         )
         speed = math.hypot(*self.vehicle.v_ned_m_s)
         command = self.strategy.decide(
-            Observation(self.now_ns, percept, summary, self.vehicle, self.vehicle, self.baseline_m, speed, engaged)
+            Observation(self.now_ns, percept, summary, self.vehicle, self.vehicle, self.baseline_m, speed, speed, engaged)
         )
         self.commands.append(command)
         self.phases.append(self.strategy._phase)

@@ -81,7 +81,7 @@ def decide(imo: Imo, found: Track | None, at_s: float = 10.0, engaged: bool = Tr
     summary = DepthSummary(1, 0, 0, 0.1, 0.0, 740.0, 0.8, 0.25, 0.5, 1.0, 0.0, 2.0, 0.1, "")
     percept = ImoPercept(found, 100, 10, profile())
     return imo.decide(
-        Observation(round(at_s * S), percept, summary, vehicle, vehicle, 0.1, 0.5, engaged)
+        Observation(round(at_s * S), percept, summary, vehicle, vehicle, 0.1, 0.5, 0.5, engaged)
     )
 
 
