@@ -247,7 +247,7 @@ class Forest(Strategy):
         course = math.atan2(vy, vx) if speed > 0.5 else heading
         turn = self._turn.step(wrap_rad(heading - course), dt_s, low=-MOST_TURN_RAD, high=MOST_TURN_RAD)
         command_rad = course + turn if speed > 0.5 else heading
-        slim = self._half_width_m(self.parameters.tight_margin_m * 0.5, observation.baseline_m)
+        slim = self._half_width_m(self._slim_margin_m(), observation.baseline_m)
         reach = self.parameters.reach_m
         drift = float(free_distance_m(obstacles, np.array([course]), slim, reach)[0]) if speed > 0.5 else reach
         clear = min(z_close, drift)
@@ -269,6 +269,10 @@ class Forest(Strategy):
             z_close,
             {"heading_rad": heading, "drift_m": drift, "half_width_m": half_width},
         )
+
+    def _slim_margin_m(self) -> float:
+        """Room kept on the way that is flown anyway; more with frames far apart, since forecasts of it err more."""
+        return self.parameters.tight_margin_m * min(1.0, max(0.5, self.craft.frame_period_s))
 
     def _homing_m_s(self, to_goal: tuple[float, float], course_rad: float) -> float:
         """Return the speed at which the turn onto the goal is narrow enough not to circle around it."""

@@ -58,6 +58,12 @@ def test_a_tree_between_two_courses_is_slowed_for_when_braking_would_end_in_it(a
     assert (share(0.2, tree, AHEAD, ASIDE, braking_s=1.1) < 1.0) == slower
 
 
+@pytest.mark.parametrize(("frame_period_s", "share_of_tight"), [(0.1, 0.5), (0.2, 0.5), (0.8, 0.8), (2.0, 1.0)])
+def test_frames_far_apart_take_more_room(frame_period_s: float, share_of_tight: float) -> None:
+    mission = forest(frame_period_s)
+    assert mission._slim_margin_m() == pytest.approx(share_of_tight * mission.parameters.tight_margin_m)
+
+
 @pytest.mark.parametrize("obstacles", [np.empty((0, 2)), np.array([[9.0, -5.0]])], ids=["nothing", "far away"])
 def test_a_free_way_is_not_slowed(obstacles: np.ndarray) -> None:
     assert share(1.0, obstacles, AHEAD, ASIDE, braking_s=1.1) == 1.0
