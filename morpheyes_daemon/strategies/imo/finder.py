@@ -131,9 +131,10 @@ class Finder:
 
     def _see(self, candidate: _Candidate, frame: Frame, depth: DepthMap, dt_s: float) -> None:
         candidate.filter.predict(dt_s)
-        sighting = sight(frame, _expected(candidate, frame))
+        expected = _expected(candidate, frame)
+        sighting = sight(frame, expected)
         candidate.sighting = None
-        if sighting is not None:
+        if sighting is not None and not (candidate.confirmed and _hides(sighting, expected)):
             p_ned, covariance = _measured(sighting, frame, depth)
             if candidate.filter.surprise(p_ned, covariance) < GATE:
                 candidate.filter.update(p_ned, covariance)
@@ -148,7 +149,7 @@ class Finder:
         """Tell candidates which clusters are theirs; make new candidates of the rest."""
         moved: dict[int, int] = {}
         for cluster in self.clusters:
-            p_ned = frame.T_ned_rect[:3, :3] @ cluster.p_rect + frame.T_ned_rect[:3, 3]
+            p_ned = _to_ned(frame, cluster.p_rect)
             owner = next((c for c in self._candidates if _owns(c, p_ned, cluster)), None)
             if owner is not None:
                 owner.radius_m = _grown(owner.radius_m, cluster)
@@ -252,10 +253,15 @@ def _expected(candidate: _Candidate, frame: Frame) -> Expected:
     )
 
 
+def _hides(sighting: Sighting, expected: Expected) -> bool:
+    """Tell whether something else is seen before the object: nearer by its size, and a piece of what is larger."""
+    nearer_m = float(expected.p_rect[2] - sighting.p_rect[2])
+    return sighting.joined >= JOINED and nearer_m > 2.0 * expected.radius_m
+
+
 def _measured(sighting: Sighting, frame: Frame, depth: DepthMap) -> tuple[Array, Array]:
     covariance = measurement_covariance(sighting.p_rect, sighting.radius_m, _eyes(depth))
-    p_ned = frame.T_ned_rect[:3, :3] @ sighting.p_rect + frame.T_ned_rect[:3, 3]
-    return p_ned, _in_ned(frame, covariance)
+    return _to_ned(frame, sighting.p_rect), _in_ned(frame, covariance)
 
 
 def _eyes(depth: DepthMap) -> Eyes:
@@ -280,6 +286,10 @@ def _grown(radius_m: float, cluster: Cluster) -> float:
 def _in_ned(frame: Frame, covariance: Array) -> Array:
     R = frame.T_ned_rect[:3, :3]
     return np.asarray(R @ covariance @ R.T)
+
+
+def _to_ned(frame: Frame, p_rect: Array) -> Array:
+    return np.asarray(frame.T_ned_rect[:3, :3] @ p_rect + frame.T_ned_rect[:3, 3])
 
 
 def _to_rect(frame: Frame, p_ned: Array) -> Array:
