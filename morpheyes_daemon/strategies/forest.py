@@ -24,6 +24,7 @@ from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, Strat
 from morpheyes_daemon.strategies.corridor import free_distance_m
 from morpheyes_daemon.strategies.memory import ObstacleMemory
 from morpheyes_daemon.strategies.profile import Floats, ObstacleProfile, obstacle_profile, wide_runs
+from morpheyes_daemon.strategies.turns import MOST_TURN_RAD, homing_m_s, slim_margin_m, turnable_share
 from morpheyes_daemon.strategies.way_around import WayAround
 from morpheyes_daemon.transforms import wrap_rad
 
@@ -60,12 +61,6 @@ class ForestParameters(StrategyParameters):
 ASTRAY_RAD = math.radians(75.0)
 """A goal further off the nose than this lies behind."""
 
-RESPONSE_S = 0.7
-"""Time constant with which Loiter takes up a velocity."""
-
-MOST_TURN_RAD = 0.9
-"""A command turns the course by no more."""
-
 FIRST_DETOUR_M = 4.0
 """Flown away from the goal before turning back for the first time."""
 
@@ -75,10 +70,6 @@ SEEN_S = 1.2
 
 UNSEEN_M = 2.0
 """Where something is taken to stand in a direction of which nothing at all is known."""
-
-
-STEERED = 4
-"""So many twelfths of the time that is looked ahead pass before a command shows in the course."""
 
 
 class Phase(StrEnum):
@@ -240,23 +231,23 @@ class Forest(Strategy):
         to_goal: tuple[float, float],
     ) -> MissionCommand:
         heading, half_width, z_close = choice
-        vehicle = observation.vehicle
+        vehicle, period_s = observation.vehicle, self.craft.frame_period_s
         self._phase = Phase.FLY
         vx, vy, _ = vehicle.v_ned_m_s
         speed = math.hypot(vx, vy)
         course = math.atan2(vy, vx) if speed > 0.5 else heading
         turn = self._turn.step(wrap_rad(heading - course), dt_s, low=-MOST_TURN_RAD, high=MOST_TURN_RAD)
         command_rad = course + turn if speed > 0.5 else heading
-        slim = self._half_width_m(self._slim_margin_m(), observation.baseline_m)
+        slim = self._half_width_m(slim_margin_m(self.parameters.tight_margin_m, period_s), observation.baseline_m)
         reach = self.parameters.reach_m
         drift = float(free_distance_m(obstacles, np.array([course]), slim, reach)[0]) if speed > 0.5 else reach
         clear = min(z_close, drift)
-        wanted = min(self.parameters.speed_m_s, 0.3 + 0.8 * math.hypot(*to_goal), self._homing_m_s(to_goal, course))
+        wanted = min(self.parameters.speed_m_s, 0.3 + 0.8 * math.hypot(*to_goal), homing_m_s(to_goal, course, period_s))
         facing = math.cos(min(math.pi / 2, 1.5 * abs(wrap_rad(heading - vehicle.yaw_rad))))
         wanted *= max(0.15, facing)
         way = np.array([math.cos(command_rad), math.sin(command_rad)])
         braking_s = min(observation.braking_m, reach) / max(speed, 1.0)
-        wanted *= self._turnable(obstacles, np.array([vx, vy]), wanted * way, slim, braking_s)
+        wanted *= turnable_share(obstacles, np.array([vx, vy]), wanted * way, slim, braking_s, period_s)
         self._heading_rad = heading
         self._follow(z_close, dt_s)
         return self._command(
@@ -269,40 +260,6 @@ class Forest(Strategy):
             z_close,
             {"heading_rad": heading, "drift_m": drift, "half_width_m": half_width},
         )
-
-    def _slim_margin_m(self) -> float:
-        """Room kept on the way that is flown anyway; more with frames far apart, since forecasts of it err more."""
-        return self.parameters.tight_margin_m * min(1.0, max(0.5, self.craft.frame_period_s))
-
-    def _homing_m_s(self, to_goal: tuple[float, float], course_rad: float) -> float:
-        """Return the speed at which the turn onto the goal is narrow enough not to circle around it."""
-        rate_rad_s = MOST_TURN_RAD / (2.0 * self.craft.frame_period_s + RESPONSE_S)
-        off_rad = min(math.pi / 2, abs(wrap_rad(math.atan2(to_goal[1], to_goal[0]) - course_rad)))
-        return rate_rad_s * math.hypot(*to_goal) / (2.0 * max(0.01, math.sin(off_rad)))
-
-    def _turnable(
-        self, obstacles: Floats, v_m_s: Floats, wanted_m_s: Floats, half_width_m: float, braking_s: float
-    ) -> float:
-        """Return which share of the wanted velocity keeps clear on the way to the next decision.
-
-        A velocity changes over a second, so the way to a new heading bends: with frames far apart it leaves the
-        corridors of both the old course and the new one, and points at what stands between them. It must be possible
-        to stop before that, too: `braking_s` is the braking distance over the speed.
-        """
-        t = np.linspace(0.0, 1.0, 12)[:, None] * 2.0 * self.craft.frame_period_s
-        kept = np.exp(-t / RESPONSE_S)
-        best, best_room = 0.0, -math.inf
-        for share in (1.0, 0.7, 0.45, 0.25, 0.0):
-            v = share * wanted_m_s
-            path = t * v + RESPONSE_S * (1.0 - kept) * (v_m_s - v)
-            braking = braking_s * (v + kept * (v_m_s - v))
-            braking[:STEERED] = 0.0
-            room = _room_m(obstacles, path, braking)
-            if room > half_width_m:
-                return share
-            if room > best_room + 0.02:
-                best, best_room = share, room
-        return best
 
     def _astray(self, off_goal_rad: float, distance_m: float, vehicle: VehicleState, dt_s: float) -> bool:
         """Tell whether it is time to turn back towards a goal that lies behind.
@@ -383,16 +340,6 @@ class Forest(Strategy):
 def _right_is_freer(profile: ObstacleProfile) -> bool:
     left, right = np.array_split(np.minimum(profile.range_m, profile.trust_m), 2)
     return float(right.mean()) >= float(left.mean())
-
-
-def _room_m(obstacles: Floats, path: Floats, ways: Floats) -> float:
-    """Return how near any obstacle (N, 2) comes to the stretches (M, 2) that lead from a path (M, 2) by `ways`."""
-    if not len(obstacles):
-        return math.inf
-    off = obstacles[:, None, :] - path
-    length_2 = np.maximum((ways**2).sum(axis=1), 1e-12)
-    share = np.clip((off * ways).sum(axis=2) / length_2, 0.0, 1.0)
-    return float(np.linalg.norm(off - share[..., None] * ways, axis=2).min())
 
 
 def _wrapped(angle_rad: Floats) -> Floats:

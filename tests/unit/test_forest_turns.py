@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.config import Footprint
-from morpheyes_daemon.strategies.base import Craft
-from morpheyes_daemon.strategies.forest import MOST_TURN_RAD, RESPONSE_S, Forest, ForestParameters, Goal
+from morpheyes_daemon.strategies.forest import ForestParameters
+from morpheyes_daemon.strategies.turns import MOST_TURN_RAD, RESPONSE_S, homing_m_s, slim_margin_m, turnable_share
 from morpheyes_daemon.transforms import wrap_rad
 
 TREE = np.array([[1.65, 1.5]])
@@ -17,20 +16,14 @@ TREE = np.array([[1.65, 1.5]])
 AHEAD, ASIDE = np.array([3.0, 0.0]), np.array([0.0, 3.0])
 
 
-def forest(frame_period_s: float) -> Forest:
-    craft = Craft(Footprint(), np.eye(4), (0.1, 0.3), frame_period_s, 3.0, 0.2)
-    return Forest(ForestParameters(goal=Goal()), craft)
-
-
 def share(
     frame_period_s: float, obstacles: np.ndarray, before: np.ndarray, wanted: np.ndarray, braking_s: float = 0.0
 ) -> float:
-    return forest(frame_period_s)._turnable(obstacles, before, wanted, 0.4, braking_s)
+    return turnable_share(obstacles, before, wanted, 0.4, braking_s, frame_period_s)
 
 
 def nearest_m(frame_period_s: float, course_rad: float, speed_m_s: float) -> float:
     """How near to its goal, 5 m to the north, a point comes that turns as slowly as decisions so far apart let it."""
-    mission = forest(frame_period_s)
     rate_rad_s = MOST_TURN_RAD / (2.0 * frame_period_s + RESPONSE_S)
     place, nearest, dt_s = np.array([-5.0, 0.0]), math.inf, 0.02
     for _ in range(3000):
@@ -38,7 +31,7 @@ def nearest_m(frame_period_s: float, course_rad: float, speed_m_s: float) -> flo
         nearest = min(nearest, distance_m)
         off_rad = wrap_rad(math.atan2(-place[1], -place[0]) - course_rad)
         course_rad += max(-rate_rad_s * dt_s, min(rate_rad_s * dt_s, off_rad))
-        speed = min(speed_m_s, mission._homing_m_s((-place[0], -place[1]), course_rad))
+        speed = min(speed_m_s, homing_m_s((-place[0], -place[1]), course_rad, frame_period_s))
         place = place + dt_s * speed * np.array([math.cos(course_rad), math.sin(course_rad)])
     return nearest
 
@@ -60,8 +53,7 @@ def test_a_tree_between_two_courses_is_slowed_for_when_braking_would_end_in_it(a
 
 @pytest.mark.parametrize(("frame_period_s", "share_of_tight"), [(0.1, 0.5), (0.2, 0.5), (0.8, 0.8), (2.0, 1.0)])
 def test_frames_far_apart_take_more_room(frame_period_s: float, share_of_tight: float) -> None:
-    mission = forest(frame_period_s)
-    assert mission._slim_margin_m() == pytest.approx(share_of_tight * mission.parameters.tight_margin_m)
+    assert slim_margin_m(0.15, frame_period_s) == pytest.approx(share_of_tight * 0.15)
 
 
 @pytest.mark.parametrize("obstacles", [np.empty((0, 2)), np.array([[9.0, -5.0]])], ids=["nothing", "far away"])
@@ -76,4 +68,4 @@ def test_a_goal_aside_is_turned_onto_and_not_circled(frame_period_s: float, off_
 
 
 def test_a_goal_straight_ahead_is_not_slowed_for() -> None:
-    assert forest(1.0)._homing_m_s((5.0, 0.0), 0.0) > 4.0
+    assert homing_m_s((5.0, 0.0), 0.0, 1.0) > 4.0
