@@ -74,11 +74,12 @@ class SyntheticFlight:
         speed = 0.0 if braking else min(limit, 0.6 * s) * 0.93
         self.x_m = min(80.0, self.x_m + speed / STICK_HZ)
         wanted = float(np.clip(0.04 * z_close, 0.1, 0.3))
+        wanted_m_s = 0.5 if s > 13.0 else 3.5
         self.baseline_m += float(np.clip(wanted - self.baseline_m, -0.001, 0.001))
         self._publish_vehicle(t, s, speed, braking)
         self.topics.baseline.publish(BaselineEstimate(t, wanted, self.baseline_m, 0.0015, wanted != self.baseline_m))
         self.topics.governed.publish(
-            Governed(t, limit, "stopping", z_close, 30 * self.baseline_m, speed, 3.5)
+            Governed(t, limit, "clear", z_close, 30 * self.baseline_m, speed, wanted_m_s)
         )
         if i % (STICK_HZ // CAMERA_HZ) == 0:
             self._publish_perception(t, i, z_close, wanted, braking)

@@ -28,5 +28,11 @@ def command(
         typer.echo(json.dumps({**to_plain(numbers), "written": written}, indent=2))
         return
     for key, value in asdict(numbers).items():
-        typer.echo(f"{key:20} {value:.2f}" if isinstance(value, float) else f"{key:20} {value}")
+        typer.echo(f"{key:20} {_as_text(value)}")
     typer.echo("\n".join(written))
+
+
+def _as_text(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {share:.0%}" for name, share in value.items())
+    return f"{value:.2f}" if isinstance(value, float) else str(value)

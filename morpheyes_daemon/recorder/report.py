@@ -6,6 +6,7 @@ Uses what the autopilot reported; the simulator's own `summary.json` knows the t
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +38,8 @@ class Figures:
     perception_rate_hz: float
     braking_events: int
     events: int
+    held_by: dict[str, float]
+    """Share of the engaged time in which the mission, or else which bound of the governor, kept the speed down."""
 
 
 def figures(series: FlightSeries, mission: str) -> Figures:
@@ -60,7 +63,17 @@ def figures(series: FlightSeries, mission: str) -> Figures:
         perception_rate_hz=frames / series.duration_s if series.duration_s else math.nan,
         braking_events=len(series.braking()),
         events=len(series.events),
+        held_by=_held_by(series, engaged),
     )
+
+
+def _held_by(series: FlightSeries, engaged: list[tuple[float, float]]) -> dict[str, float]:
+    flown = [
+        governed.bound if governed.wanted_m_s > 0.999 * governed.limit_m_s else "mission"
+        for t_s, governed in zip(series.times_s("governed"), series.messages("governed"), strict=True)
+        if any(start_s <= t_s <= end_s for start_s, end_s in engaged)
+    ]
+    return {name: times / len(flown) for name, times in Counter(flown).most_common()}
 
 
 def _path_m(series: FlightSeries, start_s: float, end_s: float) -> float:

@@ -18,8 +18,11 @@ RESPONSE_S = 0.7
 MOST_TURN_RAD = 0.9
 """A command turns the course by no more."""
 
+POINTS = 12
+"""The way that is looked ahead is looked at in so many."""
+
 STEERED = 4
-"""So many twelfths of the time that is looked ahead pass before a command shows in the course."""
+"""From so many of them on a command shows in the course; braking from before would follow the old one in any case."""
 
 
 def slim_margin_m(tight_margin_m: float, frame_period_s: float) -> float:
@@ -48,7 +51,7 @@ def turnable_share(
     of both the old course and the new one, and points at what stands between them. It must be possible to stop before
     that, too: `braking_s` is the braking distance over the speed.
     """
-    t = np.linspace(0.0, 1.0, 12)[:, None] * 2.0 * frame_period_s
+    t = np.linspace(0.0, 1.0, POINTS)[:, None] * 2.0 * frame_period_s
     kept = np.exp(-t / RESPONSE_S)
     best, best_room = 0.0, -math.inf
     for share in (1.0, 0.7, 0.45, 0.25, 0.0):

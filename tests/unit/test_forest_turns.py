@@ -51,6 +51,17 @@ def test_a_tree_between_two_courses_is_slowed_for_when_braking_would_end_in_it(a
     assert (share(0.2, tree, AHEAD, ASIDE, braking_s=1.1) < 1.0) == slower
 
 
+def test_a_tree_within_braking_on_the_old_course_leaves_it_to_what_stands_on_the_new_one() -> None:
+    ahead, aside = np.array([[3.1, 0.0]]), np.array([[2.6, 2.05]])
+    assert share(0.4, ahead, AHEAD, ASIDE, braking_s=1.1) == 1.0
+    assert share(0.4, np.concatenate([ahead, aside]), AHEAD, ASIDE, braking_s=1.1) == 0.45
+
+
+def test_where_nothing_keeps_clear_the_roomiest_way_is_taken() -> None:
+    before_and_behind = np.array([[1.37, 0.03], [1.92, 3.31]])
+    assert share(1.0, before_and_behind, AHEAD, ASIDE, braking_s=1.1) == 0.45
+
+
 @pytest.mark.parametrize(("frame_period_s", "share_of_tight"), [(0.1, 0.5), (0.2, 0.5), (0.8, 0.8), (2.0, 1.0)])
 def test_frames_far_apart_take_more_room(frame_period_s: float, share_of_tight: float) -> None:
     assert slim_margin_m(0.15, frame_period_s) == pytest.approx(share_of_tight * 0.15)

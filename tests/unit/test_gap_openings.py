@@ -8,7 +8,7 @@ import pytest
 from walls import PINHOLE, T_ned_rect, depth_map, depth_of_wall, rectangle
 
 from morpheyes_daemon.strategies.opening import Silhouette, find_openings, passage
-from morpheyes_daemon.strategies.wall import split
+from morpheyes_daemon.strategies.wall import median, split
 
 VEHICLE = Silhouette(0.337, 0.187)
 PX_M = 4.0 / PINHOLE.f_px
@@ -118,3 +118,10 @@ def test_the_safest_point_of_a_symmetric_hole_is_its_middle():
     T = T_ned_rect()
     (opening,) = openings(depth_of_wall([rectangle(0.1, -1.5, 0.5, 0.4)], T)[0], T)
     assert opening.safest.p_ned_m[1:] == pytest.approx((0.1, -1.5), abs=3 * PX_M)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("n", [1, 2, 3, 10, 101])
+def test_the_median_is_the_usual_one(n, dtype):
+    values = np.random.default_rng(n).normal(size=n).astype(dtype)
+    assert median(values) == pytest.approx(float(np.median(values)), rel=1e-6)
