@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.strategies.way_around import STALLED_S, WayAround
+from morpheyes_daemon.strategies.way_around import PATIENCE_S, STALLED_S, WayAround
 
 LATER_NS = round((STALLED_S + 1.0) * S)
 HEADINGS = np.linspace(-0.5, 0.5, 11)
@@ -45,6 +45,24 @@ def test_it_ends_where_nothing_is_in_the_way() -> None:
     assert around.update(20.0, 0.3, LATER_NS)
     around.end(LATER_NS)
     assert not around.update(20.0, 0.3, LATER_NS + S)
+
+
+def flown_s(around: WayAround, second: int) -> int:
+    """How long the way around that begins after `second` is flown when it leads nowhere."""
+    while not around.update(20.0, 0.3, second * S):
+        second += 1
+    begun = second
+    while around.update(20.0, 0.3, second * S):
+        second += 1
+    return second - begun
+
+
+def test_one_that_leads_nowhere_is_given_up_the_next_one_later() -> None:
+    around = WayAround()
+    assert flown_s(around, 0) == PATIENCE_S
+    assert flown_s(around, 100) == 2 * PATIENCE_S
+    assert not around.update(15.0, 0.3, 300 * S), "nearer"
+    assert flown_s(around, 300) == PATIENCE_S, "patience is for one obstacle"
 
 
 def test_forgotten_before_the_mission_engages() -> None:
