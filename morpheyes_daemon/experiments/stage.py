@@ -134,6 +134,11 @@ class Stage:
         baseline_m = self.baseline_m(t_ns)
         return lambda: self.camera.render_pair(t_ns, seq, self._pose_at, baseline_m)
 
+    def rehearsal(self, t_ns: int) -> Callable[[], RawPair]:
+        """Return what renders a pair as if everything stood as it does at `t_ns`, however late that becomes."""
+        baseline_m, pose = self.baseline_m(t_ns), self._pose_at(t_ns)
+        return lambda: self.camera.render_pair(t_ns, 0, lambda _: pose, baseline_m)
+
     @property
     def delivery_ns(self) -> int:
         """From mid-exposure of the left eye to the pair being there."""

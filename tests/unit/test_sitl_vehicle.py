@@ -10,8 +10,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
+from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.experiments.stage import Stage
 from morpheyes_daemon.simulation.radio import Radio
-from morpheyes_daemon.simulation.sitl_vehicle import AHEAD_NS, SitlVehicle
+from morpheyes_daemon.simulation.sitl_vehicle import AHEAD_NS, KEPT, SitlVehicle
 from tests.hand_clock import HandClock
 
 LAT, LON, ALT = -353632620, 1491652370, 584.0
@@ -101,3 +103,18 @@ async def test_a_sitl_that_has_stopped_is_not_waited_for_in_vain() -> None:
     bench.clock.t_ns += S
     with pytest.raises(DeviceTimeoutError, match="stopped"):
         await bench.vehicle.catch_up()
+
+
+def test_a_first_picture_may_take_longer_than_poses_are_kept() -> None:
+    bench = Bench()
+    bench.say(0.0, 0.0, 1.5)
+    plan = make_plan("forest", size="160x120", calibration="exact")
+    stage = Stage(plan.scenario, plan.config, bench.clock, vehicle=bench.vehicle)
+    picture, rehearsed = stage.exposure(1, bench.clock.now_ns()), stage.rehearsal(bench.clock.now_ns())
+    for _ in range(KEPT):
+        bench.clock.t_ns += 10 * MS
+        bench.say(0.0, 0.0, 1.5)
+    with pytest.raises(InputError, match="is not known"):
+        picture()
+    assert rehearsed().left.shape == (120, 160, 3)
+    stage.close()
