@@ -164,7 +164,7 @@ async def _fly(job: SimulatorJob, pipe: Connection, stage: Stage, crew: Crew, ur
     began_ns = clock.now_ns()
     try:
         with _hearing(pipe, heard):
-            await exposures.rehearse()
+            await exposures.next()  # compiles what is not compiled yet
             async with _background(stage.teensy.run(), frames.run(), _report(stage, heard, pipe, began_ns)):
                 await frames.listening.wait()
                 pipe.send(Ready(url, f"serial:{port.path}:115200", scene_of(stage.world).as_json()))
@@ -203,11 +203,6 @@ class Exposures:
     def __init__(self, stage: Stage) -> None:
         self._stage = stage
         self._seq = 0
-
-    async def rehearse(self) -> None:
-        """Compile what is not compiled yet; that may take longer than a SITL's poses are kept."""
-        await self._stage.vehicle.catch_up()
-        await asyncio.to_thread(self._stage.rehearsal(self._stage.clock.now_ns()))
 
     async def next(self) -> RawPair:
         """Expose now and return the pair."""

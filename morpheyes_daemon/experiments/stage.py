@@ -27,7 +27,6 @@ from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
 from morpheyes_daemon.simulation.vehicle import Truth, Vehicle
 from morpheyes_daemon.simulation.wind import WindConditions
 from morpheyes_daemon.simulation.worlds import World, build_world, load_world
-from morpheyes_daemon.transforms import Array
 
 READOUT_NS = 10 * MS
 """From mid-exposure of the later eye to the daemon having the pair."""
@@ -130,14 +129,10 @@ class Stage:
         return self.exposure(seq, t_ns)()
 
     def exposure(self, seq: int, t_ns: int) -> Callable[[], RawPair]:
-        """Return what renders the pair of `t_ns`; it may be called in another thread."""
+        """Return what renders the pair of `t_ns`; it may be called in another thread, and later than poses are kept."""
         baseline_m = self.baseline_m(t_ns)
-        return lambda: self.camera.render_pair(t_ns, seq, self._pose_at, baseline_m)
-
-    def rehearsal(self, t_ns: int) -> Callable[[], RawPair]:
-        """Return what renders a pair as if everything stood as it does at `t_ns`, however late that becomes."""
-        baseline_m, pose = self.baseline_m(t_ns), self._pose_at(t_ns)
-        return lambda: self.camera.render_pair(t_ns, 0, lambda _: pose, baseline_m)
+        poses = {at_ns: self.vehicle.truth_at(at_ns).T_ned_frd for at_ns in self.camera.instants_ns(t_ns)}
+        return lambda: self.camera.render_pair(t_ns, seq, poses.__getitem__, baseline_m)
 
     @property
     def delivery_ns(self) -> int:
@@ -147,9 +142,6 @@ class Stage:
     def close(self) -> None:
         """End the render threads."""
         self.camera.close()
-
-    def _pose_at(self, t_ns: int) -> Array:
-        return self.vehicle.truth_at(t_ns).T_ned_frd
 
 
 class StageCamera:

@@ -111,13 +111,16 @@ class CameraTwin:
         left, right = (self._develop(eye, views[eye], seq, exposure) for eye in (0, 1))
         return RawPair(seq, t_ns, frozen(left), frozen(right))
 
+    def instants_ns(self, t_ns: int) -> list[int]:
+        """Return the times at which `render_pair` asks where the vehicle is."""
+        return self._exposed_ns(t_ns) + self._exposed_ns(self._right_ns(t_ns))
+
     def true_depth(self, t_ns: int, pose_at: PoseAt, baseline_true_m: float) -> FloatMap:
         """Return the true depth (H, W) along z of every pixel of the raw left image, inf for sky; for judges."""
         return self._lenses[0].depth(self._view(0, t_ns, pose_at, baseline_true_m))
 
     def _views(self, t_ns: int, pose_at: PoseAt, baseline_true_m: float) -> tuple[Rendered, Rendered]:
-        """Render both eyes; poses are asked for here, since `pose_at` need not be safe in threads."""
-        right_ns = t_ns + round(self.sensor.sync_offset_s * 1e9)
+        right_ns = self._right_ns(t_ns)
         if self._pool is None:
             left = self._view(0, t_ns, pose_at, baseline_true_m)
             return left, self._view(1, right_ns, pose_at, baseline_true_m)
@@ -125,10 +128,17 @@ class CameraTwin:
         right_job = self._pool.submit(self._view, 1, right_ns, pose_at, baseline_true_m)
         return left_job.result(), right_job.result()
 
+    def _right_ns(self, t_ns: int) -> int:
+        return t_ns + round(self.sensor.sync_offset_s * 1e9)
+
+    def _exposed_ns(self, t_ns: int) -> list[int]:
+        """Return the moments of which the picture of one eye is the mean."""
+        n = self.sensor.sub_exposures
+        return [t_ns + round(((k + 0.5) / n - 0.5) * self.sensor.exposure_time_s * 1e9) for k in range(n)]
+
     def _view(self, eye: int, t_ns: int, pose_at: PoseAt, baseline_true_m: float) -> Rendered:
         n = self.sensor.sub_exposures
-        offsets = [((k + 0.5) / n - 0.5) * self.sensor.exposure_time_s for k in range(n)]
-        views = [self._instant(eye, t_ns + round(offset * 1e9), pose_at, baseline_true_m) for offset in offsets]
+        views = [self._instant(eye, at_ns, pose_at, baseline_true_m) for at_ns in self._exposed_ns(t_ns)]
         if n == 1:
             return views[0]
         mean = sum((view.radiance for view in views[1:]), views[0].radiance) / np.float32(n)

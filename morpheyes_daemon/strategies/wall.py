@@ -174,7 +174,7 @@ def _wall_plane(inverse: InverseDepth, width: int, sigma_1_m: float) -> tuple[Pl
 
 
 def median(values: NDArray[np.floating]) -> float:
-    """Return the median of known values (n,), n > 0; np.median's checks cost more than the work on a thousand."""
+    """Return the median of known values (n,), n > 0, without the checks of np.median."""
     half = values.size // 2
     if values.size % 2:
         return float(np.partition(values, half)[half])
