@@ -64,9 +64,9 @@ ASTRAY_RAD = math.radians(75.0)
 FIRST_DETOUR_M = 4.0
 """Flown away from the goal before turning back for the first time."""
 
-
-SEEN_S = 1.2
-"""A direction without depth goes by what was known of it for this long; a hard stop takes about as long."""
+OPEN_SHARE = 0.6
+"""A heading is open when it is free for this share of what is compared. It does not shrink with the speed: a slow
+vehicle would find a heading into a tree good enough, and stay slow."""
 
 UNSEEN_M = 2.0
 """Where something is taken to stand in a direction of which nothing at all is known."""
@@ -88,9 +88,7 @@ class Forest(Strategy):
 
     def __init__(self, parameters: ForestParameters, craft: Craft) -> None:
         super().__init__(parameters, craft)
-        self._memory = ObstacleMemory(
-            max(parameters.memory_s, 10 * craft.frame_period_s), max(SEEN_S, 2.5 * craft.frame_period_s)
-        )
+        self._memory = ObstacleMemory(max(parameters.memory_s, 10 * craft.frame_period_s))
         self._turn = Pid(PidGains(*parameters.turn_gains))
         self._goal_ned_m: tuple[float, float] | None = None
         self._height_m = parameters.height_m
@@ -158,13 +156,13 @@ class Forest(Strategy):
             self._height_m = vehicle.height_m if math.isfinite(vehicle.height_m) else -vehicle.p_ned_m[2]
 
     def _obstacles(self, profile: ObstacleProfile, observation: Observation) -> Floats:
-        """Every known obstacle point (N, 2) relative to the vehicle; what is unknown for long counts as one."""
+        """Every known obstacle point (N, 2) relative to the vehicle; what was never seen to be free counts as one."""
         points = [self._memory.points_ned_m]
-        bins = np.nonzero(wide_runs(profile.unknown, 3) & ~self._memory.seen_lately(profile))[0]
+        reach_m = self.parameters.reach_m
+        bins = np.nonzero(wide_runs(profile.unknown, 3))[0]
         if bins.size:
-            remembered = self._memory.nearest_along(profile)[bins]
-            ranges = np.where(np.isfinite(remembered), remembered, UNSEEN_M)
-            ranges = np.fmax(profile.behind_m[bins], np.where(np.isnan(profile.behind_m[bins]), ranges, 0.0))
+            ranges = np.fmax(self._memory.seen_free_m(profile, bins, UNSEEN_M, reach_m), profile.behind_m[bins])
+            bins, ranges = bins[ranges < reach_m], ranges[ranges < reach_m]
             angle = profile.azimuth_rad[bins]
             x = profile.origin_ned_m[0] + ranges * np.cos(angle)
             y = profile.origin_ned_m[1] + ranges * np.sin(angle)
@@ -186,7 +184,6 @@ class Forest(Strategy):
         parameters = self.parameters
         reach = min(parameters.reach_m, profile.trust_m)
         headings = profile.azimuth_rad[3:-3]
-        need = max(parameters.safe_m, min(observation.reserve_m, reach * 0.6))
         for margin_m in (parameters.margin_m, parameters.tight_margin_m):
             half_width = self._half_width_m(margin_m, observation.baseline_m)
             free = free_distance_m(obstacles, headings, half_width, reach)
@@ -210,7 +207,7 @@ class Forest(Strategy):
         heading = clipped_goal + weight * wrap_rad(free_rad - clipped_goal)
         z_close = float(free_distance_m(obstacles, np.array([heading]), half_width, reach)[0])
         z_free = float(free_distance_m(obstacles, np.array([free_rad]), half_width, reach)[0])
-        if z_close < min(need, z_free):
+        if z_close < min(OPEN_SHARE * reach, distance_m, z_free):
             heading, z_close = free_rad, z_free
         return heading, half_width, z_close
 

@@ -1,35 +1,42 @@
-"""The forest mission asks for less speed where a turn could not be stopped in before what stands in it."""
+"""Where the forest mission goes and how fast: turns it could not stop in, what lies open, strips it cannot see."""
 
 import math
 from dataclasses import replace
 
-import numpy as np
+import pytest
+from seen_from_above import CRAFT, SUMMARY, blind, empty_profile, with_points
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import Footprint
-from morpheyes_daemon.messages import DepthSummary, VehicleState
-from morpheyes_daemon.strategies.base import Craft, Observation
-from morpheyes_daemon.strategies.forest import Forest, ForestParameters
+from morpheyes_daemon.messages import MissionCommand, VehicleState
+from morpheyes_daemon.strategies.base import Observation
+from morpheyes_daemon.strategies.forest import Forest, ForestParameters, Goal
 from morpheyes_daemon.strategies.profile import ObstacleProfile
-from morpheyes_daemon.transforms import R_FRD_CAM, pose
 
-CRAFT = Craft(Footprint(), pose(R_FRD_CAM, np.array([0.09, 0.0, -0.02])), (0.1, 0.3), 0.2, 3.0, 0.2)
-SUMMARY = DepthSummary(1, 0, 0, 0.1, 0.0, 740.0, 0.8, 0.25, 0.5, 1.0, 0.0, 2.0, 0.1, "")
+FLYING = VehicleState(
+    t_ns=S, position_t_ns=S, p_ned_m=(0.0, 0.0, -1.5), v_ned_m_s=(3.0, 0.0, 0.0), height_m=1.5
+)
+
+NORTH = Goal(forward_m=80.0)
+
+
+def engaged(
+    profiles: list[ObstacleProfile], vehicle: VehicleState = FLYING, braking_m: float = 3.3, goal: Goal = NORTH
+) -> MissionCommand:
+    """The last command of a mission that engaged on a free view and was shown profiles at 5 Hz."""
+    forest = Forest(ForestParameters(goal=goal), CRAFT)
+    still = replace(vehicle, v_ned_m_s=(0.0, 0.0, 0.0))
+    command = forest.decide(Observation(S, empty_profile(), SUMMARY, still, still, 0.1, 0.0, 0.5, False))
+    for k, profile in enumerate(profiles, 1):
+        t_ns = S + k * S // 5
+        shown = replace(profile, t_ns=t_ns)
+        command = forest.decide(Observation(t_ns, shown, SUMMARY, vehicle, vehicle, 0.1, braking_m, 2.0 * braking_m, True))
+    return command
 
 
 def wanted_m_s(course_rad: float, trees: list[tuple[float, float]], braking_m: float) -> float:
-    """Speed asked for on a course beside the goal, which lies north; trees north and east of the vehicle."""
-    forest = Forest(ForestParameters(), CRAFT)
-    bins = np.linspace(-0.6, 0.6, 121)
-    free, no = np.full(121, np.inf), np.zeros(121, dtype=np.bool_)
-    points = np.array(trees, dtype=np.float64).reshape(-1, 2)
-    profile = ObstacleProfile(S, (0.0, 0.0, -1.5), (0.0, 0.0), bins, free, no, free * np.nan, no, points, 12.0, 0.5)
-    still = VehicleState(t_ns=S, position_t_ns=S, p_ned_m=(0.0, 0.0, -1.5), height_m=1.5)
-    velocity = (3.0 * math.cos(course_rad), 3.0 * math.sin(course_rad), 0.0)
-    flying = replace(still, v_ned_m_s=velocity)
-    before = Observation(S, profile, SUMMARY, still, still, 0.1, 0.0, 0.5, False)
-    forest.decide(before)
-    command = forest.decide(replace(before, now_ns=S + S // 5, vehicle=flying, braking_m=braking_m, engaged=True))
+    """Speed asked for on a course beside the goal; trees north and east of the vehicle."""
+    vehicle = replace(FLYING, v_ned_m_s=(3.0 * math.cos(course_rad), 3.0 * math.sin(course_rad), 0.0))
+    command = engaged([with_points(empty_profile(), trees)], vehicle, braking_m)
     return math.hypot(command.v_ned_m_s[0], command.v_ned_m_s[1])
 
 
@@ -42,3 +49,36 @@ def test_a_turn_that_sweeps_over_a_tree_within_braking_is_taken_slower() -> None
 
 def test_a_turn_through_free_space_is_not_slowed() -> None:
     assert wanted_m_s(0.8, [], braking_m=3.3) == wanted_m_s(0.8, [], braking_m=0.0) > 3.5
+
+
+@pytest.mark.parametrize("speed_m_s", [0.3, 3.0])
+def test_with_something_near_ahead_it_turns_to_what_is_open_however_slow_it_is(speed_m_s: float) -> None:
+    vehicle = replace(FLYING, v_ned_m_s=(speed_m_s, 0.0, 0.0))
+    trees = with_points(empty_profile(), [(5.0, 0.1 * k) for k in range(-30, 6)])
+    command = engaged([trees], vehicle, braking_m=1.1 * speed_m_s)
+    assert command.detail["heading_rad"] > 0.15
+    assert command.z_close_m > 10.0
+
+
+def test_what_stands_behind_the_goal_does_not_turn_it_away() -> None:
+    behind = with_points(empty_profile(), [(3.5, 0.1 * k) for k in range(7, 20)])
+    goal = Goal(forward_m=2.0, right_m=0.6)
+    slow = replace(FLYING, v_ned_m_s=(0.3, 0.0, 0.0))
+    assert engaged([behind], slow, 0.1, goal).detail["heading_rad"] == pytest.approx(math.atan2(0.6, 2.0))
+
+
+def test_a_strip_without_depth_ahead_is_flown_at_while_it_was_seen_to_be_free() -> None:
+    strip = blind(empty_profile(), -0.02, 0.02)
+    command = engaged([strip] * 10)
+    assert command.z_close_m > 8.0
+    assert abs(command.detail["heading_rad"]) < 0.05
+
+
+def test_of_a_strip_that_was_never_seen_something_may_stand_in_it() -> None:
+    forest = Forest(ForestParameters(), CRAFT)
+    strip = blind(empty_profile(), -0.02, 0.02)
+    for k in range(2):
+        t_ns = S + k * S // 5
+        shown = replace(strip, t_ns=t_ns)
+        command = forest.decide(Observation(t_ns, shown, SUMMARY, FLYING, FLYING, 0.1, 3.3, 0.5, k > 0))
+    assert abs(command.detail["heading_rad"]) > 0.1, "around it"

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from seen_from_above import CRAFT, SUMMARY, empty_profile
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import Footprint
-from morpheyes_daemon.messages import DepthSummary, Intent, MissionCommand, Track, VehicleState
-from morpheyes_daemon.strategies.base import Craft, Observation
+from morpheyes_daemon.messages import Intent, MissionCommand, Track, VehicleState
+from morpheyes_daemon.strategies.base import Observation
 from morpheyes_daemon.strategies.imo.behaviours import (
     Dodge,
     ObjectState,
@@ -19,8 +19,6 @@ from morpheyes_daemon.strategies.imo.behaviours import (
     way_out,
 )
 from morpheyes_daemon.strategies.imo.strategy import Imo, ImoParameters, ImoPercept
-from morpheyes_daemon.strategies.profile import ObstacleProfile
-from morpheyes_daemon.transforms import R_FRD_CAM, pose
 
 
 def thing(p: tuple[float, float, float], v: tuple[float, float, float], sigma: float = 0.0) -> ObjectState:
@@ -60,28 +58,15 @@ def test_the_way_out_is_across_the_path_and_away_from_it() -> None:
     assert np.allclose(out, (0.0, -1.0))  # it passes east of us, so west
 
 
-CRAFT = Craft(Footprint(), pose(R_FRD_CAM, np.array([0.09, 0.0, -0.02])), (0.1, 0.3), 0.2, 3.0, 0.2)
-
-
-def profile() -> ObstacleProfile:
-    """Nothing in sight, in all directions."""
-    bins = np.linspace(-0.4, 0.4, 81)
-    free = np.full(81, np.inf)
-    no = np.zeros(81, dtype=np.bool_)
-    empty = np.empty((0, 2))
-    return ObstacleProfile(0, (0.0, 0.0, -1.5), (0.0, 0.0), bins, free, no, free * np.nan, no, empty, 12.0, 0.5)
-
-
 def track(p: tuple[float, float, float], v: tuple[float, float, float], depth_m: float) -> Track:
     return Track(1, 10 * S, 1, True, p, v, np.eye(6) * 1e-4, (0.0, 0.0, depth_m), 0.2, 500, 0.1)
 
 
 def decide(imo: Imo, found: Track | None, at_s: float = 10.0, engaged: bool = True) -> MissionCommand:
     vehicle = VehicleState(t_ns=round(at_s * S), position_t_ns=round(at_s * S), p_ned_m=(0.0, 0.0, -1.5), height_m=1.5)
-    summary = DepthSummary(1, 0, 0, 0.1, 0.0, 740.0, 0.8, 0.25, 0.5, 1.0, 0.0, 2.0, 0.1, "")
-    percept = ImoPercept(found, 100, 10, profile())
+    percept = ImoPercept(found, 100, 10, empty_profile(0.0))
     return imo.decide(
-        Observation(round(at_s * S), percept, summary, vehicle, vehicle, 0.1, 0.5, 0.5, engaged)
+        Observation(round(at_s * S), percept, SUMMARY, vehicle, vehicle, 0.1, 0.5, 0.5, engaged)
     )
 
 
