@@ -60,11 +60,13 @@ def test_with_something_near_ahead_it_turns_to_what_is_open_however_slow_it_is(s
     assert command.z_close_m > 10.0
 
 
-def test_what_stands_behind_the_goal_does_not_turn_it_away() -> None:
+def test_what_stands_behind_the_goal_does_not_keep_it_from_turning_there() -> None:
+    before = with_points(empty_profile(), [(1.4, 0.42)])
     behind = with_points(empty_profile(), [(3.5, 0.1 * k) for k in range(7, 20)])
     goal = Goal(forward_m=2.0, right_m=0.6)
     slow = replace(FLYING, v_ned_m_s=(0.3, 0.0, 0.0))
-    assert engaged([behind], slow, 0.1, goal).detail["heading_rad"] == pytest.approx(math.atan2(0.6, 2.0))
+    assert engaged([before], slow, 0.1, goal).detail["heading_rad"] < 0.1
+    assert engaged([before, behind], slow, 0.1, goal).detail["heading_rad"] == pytest.approx(math.atan2(0.6, 2.0))
 
 
 def test_a_strip_without_depth_ahead_is_flown_at_while_it_was_seen_to_be_free() -> None:
