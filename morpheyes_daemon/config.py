@@ -161,7 +161,7 @@ class SafetyConfig(Section):
     battery_low_pct: float = Field(20.0, ge=0, le=90, description="brake and do not engage below this charge")
     depth_sigmas: float = Field(3.0, ge=1, le=6, description="depth is trusted where this many sigmas fit")
     max_relative_depth_error: float = Field(0.2, gt=0.01, le=1.0)
-    max_speed_m_s: float = Field(4.0, gt=0.1, le=10, description="a last bound; the governor is the real one")
+    max_speed_m_s: float = Field(5.0, gt=0.1, le=10, description="a last bound; the governor is the real one")
     max_lean_deg: float = Field(20.0, gt=1, le=45)
     active_braking: bool = Field(False, description="brake with opposite stick, never past zero speed")
     min_free_disk_mb: float = Field(200.0, ge=0)

@@ -42,7 +42,7 @@ class ForestParameters(StrategyParameters):
     goal: Goal = Goal()
     goal_radius_m: float = Field(1.5, gt=0.2, le=20, description="the goal counts as reached within this")
     height_m: float | None = Field(None, gt=0.3, le=20, description="None: the height at which it engaged")
-    speed_m_s: float = Field(4.0, gt=0.1, le=10, description="never wanted faster; the governor is the real bound")
+    speed_m_s: float = Field(5.0, gt=0.1, le=10, description="never wanted faster; the governor is the real bound")
     baseline_gain: float = Field(0.02, gt=0, le=1, description="K of b = K Z_close")
     baseline_smoothing_s: float = Field(0.5, ge=0, le=10, description="time constant of the low-passed Z_close")
     margin_m: float = Field(0.30, ge=0, le=3, description="room kept to obstacles on each side")
