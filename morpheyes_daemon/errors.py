@@ -3,6 +3,9 @@
 The command line prints the message alone and exits with `exit_code`.
 """
 
+import traceback
+from pathlib import Path
+
 
 class MorphEyesError(Exception):
     """Anything a person can do something about."""
@@ -52,3 +55,9 @@ class DeviceLostError(DeviceError):
 
 class DeviceTimeoutError(DeviceError):
     """The device is there but does not answer in time."""
+
+
+def mistake(error: BaseException) -> str:
+    """Return what an unforeseen error says, with the line it was raised at, for whoever writes a strategy."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"

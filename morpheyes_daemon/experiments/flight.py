@@ -9,10 +9,11 @@ from __future__ import annotations
 import asyncio
 import gc
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 from morpheyes_daemon.app import Daemon, Parts
@@ -24,8 +25,9 @@ from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceNotFoundError
 from morpheyes_daemon.experiments.judge import Judge, Outcome, Reported, Verdict
 from morpheyes_daemon.experiments.stage import Scenario, Stage, StageCamera
-from morpheyes_daemon.messages import StereoFrame
+from morpheyes_daemon.messages import Event, StereoFrame
 from morpheyes_daemon.perception import PipelineFactory
+from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.ground_crew import GroundCrew
@@ -137,6 +139,8 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     clock = running_clock()
     began_ns = clock.now_ns()
     topics, events = Topics.create(), EventLog()
+    troubles: dict[str, str] = {}
+    events.subscribe(lambda event: note_trouble(troubles, event))
     stage = Stage(plan.scenario, plan.config, clock, plan.threads)
     crew = make_crew(stage)
     opener = memory_opener(stage)
@@ -163,7 +167,7 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     ]
     running = asyncio.create_task(daemon.run(stop))
     watching = asyncio.create_task(judge.watch())
-    conducting = asyncio.create_task(conduct(crew, daemon.guardian, clock.sleep_until_ns, clock.now_ns))
+    conducting = asyncio.create_task(conduct(crew, daemon.guardian, clock.sleep_until_ns, clock.now_ns, troubles))
     try:
         done, _ = await asyncio.wait({running, watching, conducting}, return_when=asyncio.FIRST_COMPLETED)
         if conducting in done:
@@ -201,18 +205,32 @@ class Crew(Protocol):
 
 
 async def conduct(
-    crew: Crew, guardian: Reported, sleep_until_ns: Callable[[int], Any], now_ns: Callable[[], int]
+    crew: Crew,
+    guardian: Reported,
+    sleep_until_ns: Callable[[int], Any],
+    now_ns: Callable[[], int],
+    troubles: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Take off, wait until the daemon stands by, hand over; raises DeviceNotFoundError when it never gets ready."""
+    """Take off, wait until the daemon stands by, hand over; raises DeviceNotFoundError when it never gets ready.
+
+    `troubles` (`note_trouble`) tell more than the daemon's own reason.
+    """
     await crew.take_off(TAKE_OFF_HEIGHT_M)
     limit_ns = now_ns() + round(READY_LIMIT_S * S)
     while guardian.state is not State.STANDBY:
         if now_ns() > limit_ns:
-            raise DeviceNotFoundError(
-                f"The daemon did not get ready within {READY_LIMIT_S:.0f} s: {guardian.reason.text}."
-            )
+            why = next(iter(troubles.values()), guardian.reason.text).rstrip(".")
+            raise DeviceNotFoundError(f"The daemon did not get ready within {READY_LIMIT_S:.0f} s: {why}.")
         await sleep_until_ns(now_ns() + S // 20)
     crew.engage()
+
+
+def note_trouble(troubles: dict[str, str], event: Event) -> None:
+    """Keep what tasks died of, by task, until they work again."""
+    if event.reason is Reason.RECOVERED:
+        troubles.pop(event.source, None)
+    elif event.text.startswith(f"{event.source}: "):
+        troubles.setdefault(event.source, event.text)
 
 
 class Tally:

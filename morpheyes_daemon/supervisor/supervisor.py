@@ -13,7 +13,7 @@ from typing import Any
 
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import Clock, S, Ticker
-from morpheyes_daemon.errors import MorphEyesError
+from morpheyes_daemon.errors import MorphEyesError, mistake
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease
@@ -95,7 +95,7 @@ class Supervisor:
             except MorphEyesError as error:
                 text = f"{task.name}: {error}"
             except Exception as error:  # noqa: BLE001 -- the task boundary
-                text = f"{task.name}: {type(error).__name__}: {error}"
+                text = f"{task.name}: {mistake(error)}"
             self._report(task, pulse, text)
             backoff_s = FIRST_BACKOFF_S if pulse.count > beats else min(LAST_BACKOFF_S, backoff_s * 2)
             await self._clock.sleep_until_ns(self._clock.now_ns() + round(backoff_s * S))

@@ -21,7 +21,7 @@ from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, Generic, Protocol
 
-from morpheyes_daemon.errors import MorphEyesError
+from morpheyes_daemon.errors import MorphEyesError, mistake
 from morpheyes_daemon.supervisor.mailbox import Mailbox
 from morpheyes_daemon.supervisor.worker import Job, JobIn, Result, ResultOut, WorkerFailed, WorkerLost
 
@@ -307,7 +307,7 @@ def _reply(link: socket.socket, results: Mailbox, work: Callable[[], Any]) -> No
         verdict = _Verdict.DONE
     except Exception as error:  # noqa: BLE001 -- the worker's task boundary
         told = isinstance(error, MorphEyesError)
-        results.put(error if told else (f"{type(error).__name__}: {error}", traceback.format_exc()))
+        results.put(error if told else (mistake(error), traceback.format_exc()))
         verdict = _Verdict.FAILED
     link.sendall(_REPLY.pack(verdict))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from morpheyes_daemon.errors import MorphEyesError
 from morpheyes_daemon.experiments.flight import Watchers, fly
 from morpheyes_daemon.experiments.plan import make_plan
 from morpheyes_daemon.messages import MissionCommand
@@ -43,6 +44,28 @@ def test_the_documented_strategy_flies(tmp_path: Path, monkeypatch: pytest.Monke
     assert summary.outcome == "reached"
     assert max(command.v_ned_m_s[0] for command in commands) == pytest.approx(1.5, abs=0.05)
     assert commands[-1].z_close_m < 16.0
+
+
+@pytest.mark.parametrize(("method", "what"), [("perceive", "'View' object"), ("decide", "'Observation' object")])
+def test_a_mistake_in_a_strategy_is_named_with_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, what: str
+) -> None:
+    source = (
+        "from morpheyes_daemon.strategies.base import Strategy\n"
+        "class Slip(Strategy):\n"
+        f"    def {method}(self, given):\n"
+        "        return given.nothing_of_the_kind\n"
+    )
+    module = types.ModuleType("slip")
+    if method == "perceive":
+        source += "    def decide(self, observation):\n        raise NotImplementedError\n"
+    exec(compile(source, "slip.py", "exec"), module.__dict__)
+    monkeypatch.setitem(__import__("sys").modules, "slip", module)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [EntryPoint("slip", "slip:Slip", group)])
+    (tmp_path / "slip.yaml").write_text("strategy: slip\n", encoding="utf-8")
+    plan = make_plan(str(tmp_path / "slip.yaml"), world="glade", size="160x120", calibration="exact")
+    with pytest.raises(MorphEyesError, match=rf"{what} has no attribute 'nothing_of_the_kind' \(slip.py:4\)"):
+        fly(plan)
 
 
 def test_a_strategy_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
