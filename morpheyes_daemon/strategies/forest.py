@@ -62,7 +62,8 @@ ASTRAY_RAD = math.radians(75.0)
 """A goal further off the nose than this lies behind."""
 
 FIRST_DETOUR_M = 4.0
-"""Flown away from the goal before turning back for the first time."""
+"""Flown away from the goal before turning back for the first time; in proportion less from `DETOUR_FROM_M` on."""
+DETOUR_FROM_M = 8.0
 
 OPEN_SHARE = 0.6
 """A heading is open when it is free for this share of what is compared. It does not shrink with the speed: a slow
@@ -261,8 +262,8 @@ class Forest(Strategy):
     def _astray(self, off_goal_rad: float, distance_m: float, vehicle: VehicleState, dt_s: float) -> bool:
         """Tell whether it is time to turn back towards a goal that lies behind.
 
-        A detour may lead away for `_detour_m`; each turn back that brings the goal no nearer doubles it, so that a
-        pocket is left on a wider way the next time.
+        A detour may lead away for `_detour_m`, less when the goal is near and was merely missed; each turn back that
+        brings the goal no nearer doubles it, so that a pocket is left on a wider way the next time.
         """
         if self._phase is Phase.LOOK and math.isfinite(self._look_left_rad):
             return self._look_left_rad > 0.0
@@ -272,7 +273,7 @@ class Forest(Strategy):
             self._strayed_m = 0.0
             return False
         self._strayed_m += math.hypot(vehicle.v_ned_m_s[0], vehicle.v_ned_m_s[1]) * dt_s
-        if self._strayed_m < self._detour_m:
+        if self._strayed_m < self._detour_m * min(1.0, distance_m / DETOUR_FROM_M):
             return False
         self._strayed_m, self._detour_m = 0.0, 2.0 * self._detour_m
         self._start_looking(math.copysign(1.0, off_goal_rad), abs(off_goal_rad) - ASTRAY_RAD / 2)

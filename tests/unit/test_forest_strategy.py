@@ -7,7 +7,7 @@ import pytest
 from seen_from_above import CRAFT, SUMMARY, blind, empty_profile, with_points
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import MissionCommand, VehicleState
+from morpheyes_daemon.messages import Intent, MissionCommand, VehicleState
 from morpheyes_daemon.strategies.base import Observation
 from morpheyes_daemon.strategies.forest import Forest, ForestParameters, Goal
 from morpheyes_daemon.strategies.profile import ObstacleProfile
@@ -84,3 +84,21 @@ def test_of_a_strip_that_was_never_seen_something_may_stand_in_it() -> None:
         shown = replace(strip, t_ns=t_ns)
         command = forest.decide(Observation(t_ns, shown, SUMMARY, FLYING, FLYING, 0.1, 3.3, 0.5, k > 0))
     assert abs(command.detail["heading_rad"]) > 0.1, "around it"
+
+
+def turned_back_after_m(goal: Goal) -> float:
+    """How far a vehicle that never turns by itself flies north until it stops to turn back to its goal."""
+    forest = Forest(ForestParameters(goal=goal), CRAFT)
+    for k in range(200):
+        t_ns, north_m = S + k * S // 5, 0.6 * k
+        vehicle = replace(FLYING, t_ns=t_ns, position_t_ns=t_ns, p_ned_m=(north_m, 0.0, -1.5))
+        shown = empty_profile(t_ns / S, north_m=north_m)
+        command = forest.decide(Observation(t_ns, shown, SUMMARY, vehicle, vehicle, 0.1, 3.3, 6.6, k > 0))
+        if command.intent is Intent.STOP:
+            return north_m
+    return math.inf
+
+
+def test_a_goal_that_was_just_missed_is_turned_back_to_at_once_and_a_far_one_after_a_detour() -> None:
+    assert turned_back_after_m(Goal(forward_m=3.0, right_m=1.8)) == pytest.approx(3.6, abs=0.5)
+    assert turned_back_after_m(Goal(forward_m=3.0, right_m=20.0)) == pytest.approx(4.0, abs=0.5)
