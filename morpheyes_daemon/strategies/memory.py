@@ -21,6 +21,9 @@ Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 STEP_M = 0.5
 """Free space is looked up in such steps."""
 
+APART_NS = S // 10
+"""Views nearer to each other tell the same; looking through hundreds would hold up the event loop."""
+
 
 class ObstacleMemory:
     """Obstacle points (N, 2), ned metres, and views of the last `keep_s`."""
@@ -30,6 +33,10 @@ class ObstacleMemory:
         self._points: Floats = np.empty((0, 2))
         self._born_ns: np.ndarray[tuple[int], np.dtype[np.int64]] = np.empty(0, dtype=np.int64)
         self._views: deque[ObstacleProfile] = deque()
+
+    def __len__(self) -> int:
+        """How many views are remembered."""
+        return len(self._views)
 
     @property
     def points_ned_m(self) -> Floats:
@@ -42,6 +49,8 @@ class ObstacleMemory:
         born = np.full(len(profile.points_ned_m), profile.t_ns, dtype=np.int64)
         self._points = np.concatenate([self._points[keep], profile.points_ned_m])
         self._born_ns = np.concatenate([self._born_ns[keep], born])
+        if len(self._views) > 1 and self._views[-1].t_ns - self._views[-2].t_ns < APART_NS:
+            self._views.pop()
         self._views.append(profile)
         while self._views[0].t_ns <= profile.t_ns - self._keep_ns:
             self._views.popleft()

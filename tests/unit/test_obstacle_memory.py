@@ -100,3 +100,12 @@ def test_the_edge_of_a_view_is_not_looked_beyond() -> None:
     inside, outside = np.array([10]), np.array([BINS - 10])
     assert free_m(memory, turned, inside) == pytest.approx(LIMIT_M, abs=STEP_M)
     assert free_m(memory, turned, outside) == 2.0
+
+
+def test_of_a_fast_camera_ten_views_a_second_are_looked_through_and_the_newest() -> None:
+    dark = blind(empty_profile(2.01))
+    memory = remembering(*[empty_profile(1.0 + 0.01 * k) for k in range(100)], blind(empty_profile(2.0)), dark)
+    assert free_m(memory, dark) > 10.0
+    assert len(memory) <= 12
+    memory = remembering(*[blind(empty_profile(1.0 + 0.01 * k)) for k in range(100)], empty_profile(2.0))
+    assert free_m(memory, dark) > 10.0
