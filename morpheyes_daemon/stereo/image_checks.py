@@ -57,9 +57,10 @@ class ImageLimits:
     alike_share: float = 0.3
     textured_share: float = 0.3
     textured_levels: float = 5.0
-    alike_points: int = 60
+    alike_points: int = 40
     unlike_frames: int = 3
     unlike_of: int = 4
+    unlike_rad: float = 1e-2
     apart_rad: float = 3.2e-3
     apart_frames: int = 5
     apart_of: int = 8
@@ -81,9 +82,10 @@ class AlikeCheck:
     """Tells eyes that see different things, or the same at different times, or through another calibration.
 
     Of flights at 320x240 (forest, seeds 0 to 3) 0.44 to 0.89 of the textured places of the left are found again in
-    the right, with the eyes swapped 0.0 to 0.36, half of them below 0.03. One frame is no proof. Nor is it for rows
-    that are apart: 2 ms between the eyes make 4 mrad in a quick pitch, in one frame of 20 of those flights; with 20
-    ms every second frame shows as much, and the calibration of another rig 5 mrad in all.
+    the right, with the eyes swapped 0.0 to 0.36, half of them below 0.03, and where it is more (0.5 in one flight) their
+    rows are 12 mrad apart, which is as good as not found. One frame is no proof. Nor is it for rows that are apart by
+    less: 2 ms between the eyes make 4 mrad in a quick pitch, in one frame of 20 of those flights; with 20 ms every
+    second frame shows as much, and the calibration of another rig 5 mrad in all.
     """
 
     def __init__(self, limits: ImageLimits | None = None) -> None:
@@ -97,7 +99,8 @@ class AlikeCheck:
         `doubt_rad` is how far the eyes may point elsewhere than the pair was rectified for.
         """
         limits = self._limits
-        unlike = found.tried >= limits.alike_points and found.count < limits.alike_share * found.tried
+        astray = found.count >= MIN_POINTS and found.median_px > (limits.unlike_rad + doubt_rad) * f_px
+        unlike = found.tried >= limits.alike_points and (found.count < limits.alike_share * found.tried or astray)
         unlike = unlike and _textured_share(left, limits.textured_levels) > limits.textured_share
         self._unlike.append(unlike)
         apart = found.count >= MIN_POINTS and found.median_px > (limits.apart_rad + doubt_rad) * f_px

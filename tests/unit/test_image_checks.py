@@ -152,6 +152,15 @@ def test_rows_that_stay_apart_are_told_after_five_frames(pair):
     assert [ask(check, *good) for _ in range(4)] == [{ImageFault.APART}] * 3 + [set()], "four bad frames of eight"
 
 
+def test_rows_far_apart_are_told_after_three_frames_like_eyes_that_see_different_things(pair):
+    """Swapped eyes find false partners far off their rows."""
+    left, right = pair
+    apart, wrong = np.roll(right, 5, axis=0), disparity(left, right)
+    assert row_offsets(left, apart, wrong).count > 0.3 * row_offsets(left, apart, wrong).tried
+    check = AlikeCheck()
+    assert [ask(check, left, apart, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.UNLIKE}] * 2
+
+
 def test_rows_no_farther_apart_than_the_doubt_in_where_the_eyes_point_are_no_fault(pair):
     left, right = pair
     apart = np.roll(right, 2, axis=0)
