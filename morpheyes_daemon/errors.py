@@ -3,6 +3,7 @@
 The command line prints the message alone and exits with `exit_code`.
 """
 
+import sysconfig
 import traceback
 from pathlib import Path
 
@@ -58,6 +59,8 @@ class DeviceTimeoutError(DeviceError):
 
 
 def mistake(error: BaseException) -> str:
-    """Return what an unforeseen error says, with the line it was raised at, for whoever writes a strategy."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
+    """Return what an unforeseen error says, with the last line before libraries, for whoever writes a strategy."""
+    libraries = "site-packages", sysconfig.get_path("stdlib")
+    lines = traceback.extract_tb(error.__traceback__)
+    last = ([line for line in lines if not any(path in line.filename for path in libraries)] or lines)[-1]
     return f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})"

@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 
 from morpheyes_daemon.clock import run_virtual
-from morpheyes_daemon.errors import CalibrationError, UsageError
+from morpheyes_daemon.errors import CalibrationError, UsageError, mistake
 from morpheyes_daemon.experiments.branch import Branch, branch
 from morpheyes_daemon.experiments.fault_endings import REACTION_S, RELEASE_S, Ending, Fault, complaints
 from morpheyes_daemon.experiments.fault_flight import FaultFlight, Measured
@@ -161,7 +161,7 @@ async def _report(flight: FaultFlight, state: State, fault: Fault) -> dict[str, 
     try:
         row = await _try(flight, state, fault)
     except Exception as error:  # noqa: BLE001 -- the whole life of a process
-        row = make_row(fault, state, flight.plan.scenario.seed, None, (f"{type(error).__name__}: {error}",))
+        row = make_row(fault, state, flight.plan.scenario.seed, None, (mistake(error),))
     return asdict(row)
 
 

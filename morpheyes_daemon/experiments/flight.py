@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Protocol
 
 from morpheyes_daemon.app import Daemon, Parts
@@ -209,7 +208,7 @@ async def conduct(
     guardian: Reported,
     sleep_until_ns: Callable[[int], Any],
     now_ns: Callable[[], int],
-    troubles: Mapping[str, str] = MappingProxyType({}),
+    troubles: Mapping[str, str] | None = None,
 ) -> None:
     """Take off, wait until the daemon stands by, hand over; raises DeviceNotFoundError when it never gets ready.
 
@@ -219,7 +218,7 @@ async def conduct(
     limit_ns = now_ns() + round(READY_LIMIT_S * S)
     while guardian.state is not State.STANDBY:
         if now_ns() > limit_ns:
-            why = next(iter(troubles.values()), guardian.reason.text).rstrip(".")
+            why = next(iter((troubles or {}).values()), guardian.reason.text).rstrip(".")
             raise DeviceNotFoundError(f"The daemon did not get ready within {READY_LIMIT_S:.0f} s: {why}.")
         await sleep_until_ns(now_ns() + S // 20)
     crew.engage()

@@ -34,10 +34,6 @@ class ObstacleMemory:
         self._born_ns: np.ndarray[tuple[int], np.dtype[np.int64]] = np.empty(0, dtype=np.int64)
         self._views: deque[ObstacleProfile] = deque()
 
-    def __len__(self) -> int:
-        """How many views are remembered."""
-        return len(self._views)
-
     @property
     def points_ned_m(self) -> Floats:
         """Everything remembered, the newest profile included."""

@@ -4,13 +4,13 @@ import math
 from dataclasses import replace
 
 import pytest
-from seen_from_above import CRAFT, SUMMARY, blind, empty_profile, with_points
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages import Intent, MissionCommand, VehicleState
 from morpheyes_daemon.strategies.base import Observation
 from morpheyes_daemon.strategies.forest import Forest, ForestParameters, Goal
 from morpheyes_daemon.strategies.profile import ObstacleProfile
+from tests.seen_from_above import CRAFT, SUMMARY, blind, empty_profile, with_points
 
 FLYING = VehicleState(
     t_ns=S, position_t_ns=S, p_ned_m=(0.0, 0.0, -1.5), v_ned_m_s=(3.0, 0.0, 0.0), height_m=1.5

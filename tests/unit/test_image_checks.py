@@ -1,10 +1,12 @@
 """Bad images are told from good ones, and good ones are let through."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from morpheyes_daemon.messages import Pinhole
-from morpheyes_daemon.stereo.epipolar import row_offsets
+from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
 from morpheyes_daemon.stereo.image_checks import (
     AlikeCheck,
     FrozenCheck,
@@ -150,6 +152,15 @@ def test_rows_that_stay_apart_are_told_after_five_frames(pair):
     found = [ask(check, left, apart, wrong) for _ in range(6)]
     assert found == [set()] * 4 + [{ImageFault.APART}] * 2
     assert [ask(check, *good) for _ in range(4)] == [{ImageFault.APART}] * 3 + [set()], "four bad frames of eight"
+
+
+def test_few_places_of_which_none_is_found_again_are_told(pair):
+    """Swapped eyes in a dense view: hardly a place has a depth at all."""
+    nothing = RowOffsets(np.empty((0, 2)), np.empty(0), np.empty(0), tried=45)
+    check = AlikeCheck()
+    assert [check.check(pair[0], nothing, F_PX) for _ in range(3)] == [set(), set(), {ImageFault.UNLIKE}]
+    check, fewer = AlikeCheck(), replace(nothing, tried=20)
+    assert [check.check(pair[0], fewer, F_PX) for _ in range(4)] == [set()] * 4, "too few to say"
 
 
 def test_rows_far_apart_are_told_after_three_frames_like_eyes_that_see_different_things(pair):

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from seen_from_above import CRAFT, SUMMARY, empty_profile
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages import Intent, MissionCommand, Track, VehicleState
@@ -19,6 +18,7 @@ from morpheyes_daemon.strategies.imo.behaviours import (
     way_out,
 )
 from morpheyes_daemon.strategies.imo.strategy import Imo, ImoParameters, ImoPercept
+from tests.seen_from_above import CRAFT, SUMMARY, empty_profile
 
 
 def thing(p: tuple[float, float, float], v: tuple[float, float, float], sigma: float = 0.0) -> ObjectState:

@@ -7,24 +7,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from seen_from_above import BINS, blind, empty_profile, with_points
 
 from morpheyes_daemon.strategies.memory import STEP_M, ObstacleMemory
+from morpheyes_daemon.strategies.profile import ObstacleProfile
+from tests.seen_from_above import BINS, blind, empty_profile, with_points
 
 MIDDLE = np.array([BINS // 2])
 LIMIT_M = 12.0 - STEP_M
 """Profiles look 12 m far."""
 
 
-def remembering(*profiles: object, keep_s: float = 6.0) -> ObstacleMemory:
-    memory = ObstacleMemory(keep_s)
+def remembering(*profiles: ObstacleProfile) -> ObstacleMemory:
+    memory = ObstacleMemory(6.0)
     for profile in profiles:
-        memory.add(profile)  # type: ignore[arg-type]
+        memory.add(profile)
     return memory
 
 
-def free_m(memory: ObstacleMemory, profile: object, bins: np.ndarray = MIDDLE) -> float:
-    return float(memory.seen_free_m(profile, bins, 2.0, 16.0)[0])  # type: ignore[arg-type]
+def free_m(memory: ObstacleMemory, profile: ObstacleProfile, bins: np.ndarray = MIDDLE) -> float:
+    return float(memory.seen_free_m(profile, bins, 2.0, 16.0)[0])
 
 
 def test_a_tree_that_left_the_view_is_remembered_until_it_is_old() -> None:
@@ -103,9 +104,11 @@ def test_the_edge_of_a_view_is_not_looked_beyond() -> None:
 
 
 def test_of_a_fast_camera_ten_views_a_second_are_looked_through_and_the_newest() -> None:
-    dark = blind(empty_profile(2.01))
-    memory = remembering(*[empty_profile(1.0 + 0.01 * k) for k in range(100)], blind(empty_profile(2.0)), dark)
-    assert free_m(memory, dark) > 10.0
-    assert len(memory) <= 12
-    memory = remembering(*[blind(empty_profile(1.0 + 0.01 * k)) for k in range(100)], empty_profile(2.0))
-    assert free_m(memory, dark) > 10.0
+    def with_one_good_view(good: int, views: int) -> ObstacleMemory:
+        taken = [empty_profile(1.0 + 0.01 * k) for k in range(views)]
+        return remembering(*(view if k == good else blind(view) for k, view in enumerate(taken)))
+
+    dark = blind(empty_profile(1.5))
+    assert free_m(with_one_good_view(good=0, views=40), dark) > 10.0
+    assert free_m(with_one_good_view(good=5, views=40), dark) == 2.0, "let go for its neighbours"
+    assert free_m(with_one_good_view(good=39, views=40), dark) > 10.0
