@@ -1,6 +1,7 @@
 """The pieces of the moving-object search, each against a known truth."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from morpheyes_daemon.strategies.imo.clusters import clusters
 from morpheyes_daemon.strategies.imo.ego_motion import refine
 from morpheyes_daemon.strategies.imo.filter import Eyes, ObjectFilter, measurement_covariance
 from morpheyes_daemon.strategies.imo.frames import Frame
+from morpheyes_daemon.strategies.imo.sweep import swept_depth
 from morpheyes_daemon.strategies.imo.tracklets import Movers
 from morpheyes_daemon.strategies.imo.window import Expected, sight
 from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rotvec, pose
@@ -68,10 +70,14 @@ def test_too_few_standing_points_leave_what_the_autopilot_told() -> None:
     assert not ego.static.any()
 
 
-def movers(uv: list[tuple[float, float]], d: list[float], drift: list[tuple[float, float]]) -> Movers:
+def movers(
+    uv: Sequence[tuple[float, float]], d: list[float], drift: list[tuple[float, float]], sure: list[bool] | None = None
+) -> Movers:
     uvd = np.column_stack([np.array(uv), np.array(d)])
     p = frame_once().points(uvd)
-    return Movers(uvd, p, np.tile([0.3, 0.0, 0.0], (len(d), 1)), np.array(drift), np.full(len(d), 0.2))
+    v = np.tile([0.3, 0.0, 0.0], (len(d), 1))
+    surely = np.array(sure if sure is not None else [True] * len(d))
+    return Movers(uvd, p, v, np.array(drift), np.full(len(d), 0.2), surely)
 
 
 def test_tracklets_cluster_by_motion_together_with_depth() -> None:
@@ -84,6 +90,14 @@ def test_tracklets_cluster_by_motion_together_with_depth() -> None:
     assert clusters(movers(uv[:2], d[:2], [(40.0, 0.0)] * 2), frame_once()) == []
 
 
+def test_what_hardly_moves_belongs_to_the_object_it_moves_along_with_and_is_none_by_itself() -> None:
+    uv = [(100.0 + 6.0 * k, 100.0 + 5.0 * (k % 2)) for k in range(10)]
+    sure = [k < 4 for k in range(10)]
+    found = clusters(movers(uv, [30.0] * 10, [(40.0, 0.0)] * 10, sure), frame_once())
+    assert [(c.count, int(c.members.sum())) for c in found] == [(4, 10)]
+    assert clusters(movers(uv, [30.0] * 10, [(40.0, 0.0)] * 10, [False] * 10), frame_once()) == []
+
+
 @pytest.mark.parametrize(("depth_m", "edge_m"), [(0.9, 0.3), (2.0, 0.3), (4.0, 0.3), (5.0, 0.17)])
 def test_a_window_tells_the_depth_to_half_a_percent_from_filling_the_image_to_a_dozen_pixels(
     depth_m: float, edge_m: float
@@ -93,6 +107,23 @@ def test_a_window_tells_the_depth_to_half_a_percent_from_filling_the_image_to_a_
     assert found is not None
     assert found.depth_m == pytest.approx(depth_m, rel=0.005)
     assert np.allclose(found.p_rect[:2], (0.03, 0.02), atol=0.03)
+
+
+@pytest.mark.parametrize("off_m", [-0.3, 0.0, 0.3])
+def test_a_small_thing_two_disparities_before_a_wall_is_told_from_it(off_m: float) -> None:
+    f = frame(Square((5.4, 0.0, 0.0), 0.17), baseline_m=0.3)  # 12 px wide; 20.6 px of disparity, the wall 18.5
+    found = sight(f, Expected(np.array([0.0, 0.0, 5.4 + off_m]), 0.05, 0.15, 0.11))
+    assert found is not None
+    assert found.mask.sum() < 1.5 * 11.6**2
+    assert abs(found.depth_m - 5.4) < 0.08 + 0.3 * abs(off_m)
+
+
+def test_a_swept_window_tells_disparities_to_a_fraction_of_a_pixel() -> None:
+    f = frame(Square((2.5, 0.0, 0.0), 0.3), baseline_m=0.2)  # 29.6 px
+    box = slice(105, 135), slice(145, 175)
+    off_px = f.bf_m_px / swept_depth(f, box, 1.5, 4.0) - 29.6
+    assert abs(float(np.median(off_px))) < 0.15
+    assert float(np.percentile(np.abs(off_px), 90)) < 0.35
 
 
 def test_a_window_without_the_object_tells_nothing() -> None:

@@ -30,22 +30,20 @@ FEWEST = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cluster:
-    """Tracklets that move together: members, middle (3,) and velocity (3,) in rect axes, and half its size."""
+    """Tracklets that move together: members, how many of them surely move, middle (3,) and velocity (3,) in rect axes,
+
+    and half its size."""
 
     members: Mask
+    count: int
     p_rect: Array
     v_rect_m_s: Array
     radius_m: float
 
-    @property
-    def count(self) -> int:
-        """How many tracklets."""
-        return int(self.members.sum())
-
 
 def clusters(movers: Movers, frame: Frame) -> list[Cluster]:
     """Return the objects among moving tracklets, the largest first."""
-    if len(movers) < FEWEST:
+    if movers.sure.sum() < FEWEST:
         return []
     labels = _components(_linked(movers, frame))
     found = [_cluster(movers, labels == label) for label in range(labels.max() + 1)]
@@ -86,4 +84,5 @@ def _cluster(movers: Movers, members: Mask) -> Cluster:
     middle = np.median(p, axis=0)
     across = np.linalg.norm(p[:, :2] - middle[:2], axis=1)
     radius = float(np.percentile(across, 80)) + 0.03
-    return Cluster(members, middle, np.median(movers.v_rect_m_s[members], axis=0), radius)
+    sure = int((members & movers.sure).sum())
+    return Cluster(members, sure, middle, np.median(movers.v_rect_m_s[members], axis=0), radius)

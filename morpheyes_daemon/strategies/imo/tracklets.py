@@ -45,6 +45,9 @@ FINE_SPACING_PX = 4.0
 SURPRISING = 30.0
 """Squared Mahalanobis length (3 degrees of freedom) from which a sighting is not one of a standing thing."""
 
+RESTLESS = 10.0
+"""From here on one that goes on with surprising ones moves with them."""
+
 FEWEST_PX = 1.0
 """And so many pixels at least."""
 
@@ -53,13 +56,15 @@ FEWEST_PX = 1.0
 class Movers:
     """Tracklets that move by themselves: pixel and disparity (M, 3), point (M, 3) and velocity (M, 3) in rect axes,
 
-    pixels per second (M, 2) relative to the static scene, and the age (M,) in seconds of the comparison."""
+    pixels per second (M, 2) relative to the static scene, the age (M,) in seconds of the comparison, and which are
+    `sure` (M,) to move; the others do if they move along with those."""
 
     uvd: Array
     p_rect: Array
     v_rect_m_s: Array
     drift_px_s: Array
     span_s: Array
+    sure: Mask
 
     def __len__(self) -> int:
         return len(self.uvd)
@@ -163,22 +168,23 @@ class Tracklets:
     def _movers(self, now: Frame) -> Movers:
         """Compare with every former frame; the longest comparison that surprises gives the velocity."""
         count = len(self.uvd)
-        moving = np.zeros(count, dtype=np.bool_)
+        sure, moving = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         v, drift, span = np.zeros((count, 3)), np.zeros((count, 2)), np.zeros(count)
         p_now = now.points(self.uvd)
         for lag, past in enumerate(list(self._past)[:LAGS]):
             p_then = self._then[:, lag]
             residual, length = surprise(past.T_now_then, past.covariance, lag + 1, p_then, self.uvd, now, self.static)
-            new = (length > SURPRISING) & (np.linalg.norm(residual, axis=1) > FEWEST_PX)
+            new = (length > RESTLESS) & (np.linalg.norm(residual, axis=1) > FEWEST_PX)
             dt_s = (now.t_ns - past.t_ns) / S
             still = p_then @ past.T_now_then[:3, :3].T + past.T_now_then[:3, 3]
             moving |= new
+            sure |= new & (length > SURPRISING)
             v[new], drift[new], span[new] = ((p_now - still) / dt_s)[new], (residual[:, :2] / dt_s)[new], dt_s
-        self.static = self.static & ~moving
-        return Movers(self.uvd[moving], p_now[moving], v[moving], drift[moving], span[moving])
+        self.static = self.static & ~sure
+        return Movers(self.uvd[moving], p_now[moving], v[moving], drift[moving], span[moving], sure[moving])
 
 
-_NONE = Movers(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 2)), np.empty(0))
+_NONE = Movers(*(np.empty((0, 3)),) * 3, np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.bool_))
 
 
 def _block(free: NDArray[np.uint8], uv: Array, radius_px: float) -> None:

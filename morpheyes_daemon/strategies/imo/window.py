@@ -31,6 +31,9 @@ ALIKE = 0.6
 MATCH_PX = 1.0
 """A disparity of the depth map may be off by so much on a small object."""
 
+APART_PX = 0.5
+"""A background at so much less disparity is told from the object."""
+
 SMALL_PX = 60.0
 """A window that reaches less far than this from its middle, at 640 px of image width, is matched by itself."""
 
@@ -118,19 +121,30 @@ def _window(frame: Frame, expected: Expected) -> _Patch | None:
 
 
 def _own_pixels(frame: Frame, patch: _Patch, expected: Expected) -> Mask | None:
-    """Return the pixels of the window that lie where the object should be, as one piece; None when they are too few."""
+    """Return the pixels of the window that lie where the object should be, as one piece; None when they are too few.
+
+    Whatever is seen around it is its background; where that lies clearly behind, a pixel is the object's when its
+    disparity is nearer to the object's than to the background's: to the expected one or, if it is nearer, the one found.
+    """
     z0 = float(expected.p_rect[2])
-    step_m = MATCH_PX * z0 * z0 / frame.bf_m_px
+    own_px, reach_m, slack_m = frame.bf_m_px / z0, FILL * expected.radius_m, 3.0 * expected.across_m
+    middle = frame.project(expected.p_rect)[:2]
     with np.errstate(invalid="ignore"):
-        near = np.abs(patch.depth_m - z0) < FILL * expected.radius_m + 3.0 * expected.along_m + step_m
-    middle, slack = frame.project(expected.p_rect)[:2], 3.0 * expected.across_m
-    mask = near
-    for reach in (FILL * expected.radius_m + slack, FILL * expected.radius_m):
-        mask = _nearest_piece(near & _disc(frame, patch, middle, z0, reach), middle - (patch.left, patch.top))
+        disparity_px = frame.bf_m_px / patch.depth_m
+        as_far = np.abs(patch.depth_m - z0) < reach_m + 3.0 * expected.along_m + MATCH_PX * z0 / own_px
+    around = disparity_px[np.isfinite(disparity_px) & ~_disc(frame, patch, middle, z0, reach_m + slack_m)]
+    behind_px = float(np.median(around)) if around.size else 0.0
+    mask = np.asarray(as_far)
+    for reach in (reach_m + slack_m, reach_m):
+        mask = as_far & _disc(frame, patch, middle, z0, reach)
+        if own_px - behind_px > APART_PX:
+            mask &= disparity_px > 0.5 * (own_px + behind_px)
+        mask = _nearest_piece(mask, middle - (patch.left, patch.top))
         if not mask.any():
             return None
         rows, columns = np.nonzero(mask)
         middle = np.array([columns.mean() + patch.left, rows.mean() + patch.top])
+        own_px = max(own_px, float(np.median(disparity_px[mask])))
     disc_px = np.pi * (expected.radius_m * frame.pinhole.f_px / z0) ** 2
     inside = min(1.0, mask.size / disc_px)
     return mask if mask.sum() >= max(LEAST_PX * frame.scale, LEAST_SHARE * disc_px * inside) else None
