@@ -31,6 +31,7 @@ def texture(size: int, seed: int, *grains: float) -> np.ndarray:
 
 WALL = texture(3000, 1, 12.0)
 FACE = texture(400, 2, 5.0, 14.0, 36.0)
+COVER = texture(400, 3, 5.0, 14.0, 36.0)
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,15 @@ class Square:
 
 def view(
     k: int, square: Square | None, eye_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0), baseline_m: float = 0.2,
-    told_error_m: float = 0.0, hidden: bool = False,
+    told_error_m: float = 0.0, hidden: bool = False, cover: Square | None = None,
 ) -> View:  # fmt: skip
-    """Return frame `k` (5 Hz) of a rig at `eye_ned_m` looking north; the autopilot is wrong by `told_error_m` east."""
+    """Return frame `k` (5 Hz) of a rig at `eye_ned_m` looking north; the autopilot is wrong by `told_error_m` east.
+
+    `cover` is another square before `square`.
+    """
     eye = np.array(eye_ned_m)
-    shown = None if hidden else square
+    shown = [(FACE, square)] if square is not None and not hidden else []
+    shown += [(COVER, cover)] if cover is not None else []
     left, depth = _seen(eye, shown, 2 * k)
     right, _ = _seen(eye + (0.0, baseline_m, 0.0), shown, 2 * k + 1)
     t_ns = S + k * S // 5
@@ -73,11 +78,12 @@ def view(
     return View(found, left, right, vehicle, pose(R_FRD_CAM, np.zeros(3)))
 
 
-def _seen(eye: np.ndarray, square: Square | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _seen(eye: np.ndarray, shown: list[tuple[np.ndarray, Square]], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return image and depth of pictures before the wall, the farthest first."""
     image = _plane(eye, WALL, (WALL_M, 0.0, 0.0), WALL.shape[0] / TEXELS_PER_M)
     depth = np.full(image.shape, WALL_M - eye[0], dtype=np.float32)
-    if square is not None:
-        face = _plane(eye, FACE, square.p_ned_m, square.edge_m)
+    for picture, square in shown:
+        face = _plane(eye, picture, square.p_ned_m, square.edge_m)
         inside = np.isfinite(face)
         image = np.where(inside, face, image)
         depth = np.where(inside, np.float32(square.p_ned_m[0] - eye[0]), depth)

@@ -81,6 +81,24 @@ def test_it_is_found_again_after_a_second_behind_something() -> None:
     assert np.trace(behind.covariance) > np.trace(before.covariance)
 
 
+def test_what_covers_it_is_not_taken_for_it_and_does_not_turn_its_way() -> None:
+    finder = Finder(coast_s=2.0)
+    cover = Square((1.8, 0.1, 0.0), 0.3)  # hides 0.42 m at the object's depth
+    squares = along(Square((2.5, -0.6, 0.0)), (0.0, 0.06, 0.0), 26)
+    tracks = [finder.step(view(k, square, cover=cover)) for k, square in enumerate(squares)]
+    for track, square in list(zip(tracks, squares, strict=True))[6:]:
+        assert track is not None
+        if track.seen:
+            assert track.p_rect_m[2] == pytest.approx(2.5, rel=0.02)
+            # the middle of what is left of it is off by less than what is hidden
+            assert track.p_ned_m[1] == pytest.approx(square.p_ned_m[1], abs=0.16)
+    last = tracks[-1]
+    assert last is not None
+    assert last.seen
+    assert last.id == tracks[6].id
+    assert last.v_ned_m_s[1] == pytest.approx(0.3, abs=0.1)
+
+
 def test_what_stops_for_long_is_part_of_the_scene() -> None:
     finder = Finder()
     squares = along(Square((2.5, -0.4, 0.0)), (0.0, 0.06, 0.0), 10)

@@ -60,6 +60,12 @@ FEWEST_STANDING, STANDING_SHARE = 4, 0.7
 JOINED = 0.5
 """An object whose surroundings are as far away on both sides for more than this share is a piece of something."""
 
+COVERED = 0.1
+"""With a larger share of what is around it nearer, a part of an object may be hidden."""
+
+SCRAP = 0.5
+"""What has less than this of an object's radius is a scrap of it, or of something else."""
+
 UNSURE_SHARE = 0.03
 """Of the baseline: with a larger sigma of it nothing is concluded."""
 
@@ -131,19 +137,39 @@ class Finder:
 
     def _see(self, candidate: _Candidate, frame: Frame, depth: DepthMap, dt_s: float) -> None:
         candidate.filter.predict(dt_s)
-        expected = _expected(candidate, frame)
+        sighting = candidate.sighting = self._sighted(candidate, frame)
+        if sighting is None:
+            return
+        p_ned, covariance = _measured(sighting, candidate.radius_m, frame, depth)
+        if candidate.filter.surprise(p_ned, covariance) >= GATE:
+            candidate.sighting = None
+            return
+        candidate.filter.update(p_ned, covariance)
+        candidate.seen_ns = frame.t_ns
+        if sighting.joined >= JOINED and not candidate.confirmed:
+            candidate.radius_m = max(candidate.radius_m, min(ENLARGED * candidate.radius_m, ENLARGED_TO_M))
+        elif sighting.whole and sighting.covered < COVERED:
+            fresh = min(max(sighting.radius_m, SMALLEST_M), LARGEST_M)
+            candidate.radius_m += RADIUS_GAIN * (fresh - candidate.radius_m)
+
+    def _sighted(self, candidate: _Candidate, frame: Frame) -> Sighting | None:
+        """Return the candidate as seen in a frame, a confirmed one also behind something nearer at its place."""
+        expected, lost = _expected(candidate, frame), candidate.sighting is None
         sighting = sight(frame, expected)
-        candidate.sighting = None
-        if sighting is not None and not (candidate.confirmed and _hides(sighting, expected)):
-            p_ned, covariance = _measured(sighting, frame, depth)
-            if candidate.filter.surprise(p_ned, covariance) < GATE:
-                candidate.filter.update(p_ned, covariance)
-                candidate.sighting, candidate.seen_ns = sighting, frame.t_ns
-                if sighting.joined >= JOINED and not candidate.confirmed:
-                    candidate.radius_m = max(candidate.radius_m, min(ENLARGED * candidate.radius_m, ENLARGED_TO_M))
-                elif sighting.whole:
-                    fresh = min(max(sighting.radius_m, SMALLEST_M), LARGEST_M)
-                    candidate.radius_m += RADIUS_GAIN * (fresh - candidate.radius_m)
+        if sighting is None or not candidate.confirmed or not self._is_other(sighting, expected, lost):
+            return sighting
+        behind = sight(frame, expected, sighting.depth_m + expected.radius_m)
+        return None if behind is None or self._is_other(behind, expected, lost) else behind
+
+    def _is_other(self, sighting: Sighting, expected: Expected, lost: bool) -> bool:
+        """Tell whether something else is seen: a piece of what is larger, or a scrap, before the object by its size.
+
+        An object that was out of sight is found again only as a thing by itself that does not stand.
+        """
+        piece, before = sighting.joined >= JOINED, expected.p_rect[2] - sighting.p_rect[2] > 2.0 * expected.radius_m
+        if lost and (piece or self._stands(sighting)):
+            return True
+        return before and (piece or sighting.radius_m < SCRAP * expected.radius_m)
 
     def _adopt(self, frame: Frame, depth: DepthMap) -> None:
         """Tell candidates which clusters are theirs; make new candidates of the rest."""
@@ -174,17 +200,17 @@ class Finder:
         """
         if not _is_apart(candidate):
             return 0
-        stands, on_trial = self._stands(candidate), not candidate.confirmed
+        stands, on_trial = self._stands(candidate.sighting), not candidate.confirmed
         candidate.corner_frames += clustered > 0 and not stands
         if on_trial and (stands or candidate.corner_frames < CORNER_FRAMES):
             return 0 if stands else clustered
         return clustered or int(self._has_moved(candidate, frame, SURELY if stands or on_trial else LIKELY))
 
-    def _stands(self, candidate: _Candidate) -> bool:
-        """Tell whether the corners on the object agree with a scene that stands."""
-        if candidate.sighting is None:
+    def _stands(self, sighting: Sighting | None) -> bool:
+        """Tell whether the corners on what is seen agree with a scene that stands."""
+        if sighting is None:
             return False
-        standing = self.tracklets.standing(candidate.sighting.mask)
+        standing = self.tracklets.standing(sighting.mask)
         return standing.size >= FEWEST_STANDING and float(standing.mean()) > STANDING_SHARE
 
     def _has_moved(self, candidate: _Candidate, frame: Frame, sigmas: float) -> bool:
@@ -253,14 +279,12 @@ def _expected(candidate: _Candidate, frame: Frame) -> Expected:
     )
 
 
-def _hides(sighting: Sighting, expected: Expected) -> bool:
-    """Tell whether something else is seen before the object: nearer by its size, and a piece of what is larger."""
-    nearer_m = float(expected.p_rect[2] - sighting.p_rect[2])
-    return sighting.joined >= JOINED and nearer_m > 2.0 * expected.radius_m
-
-
-def _measured(sighting: Sighting, frame: Frame, depth: DepthMap) -> tuple[Array, Array]:
+def _measured(sighting: Sighting, radius_m: float, frame: Frame, depth: DepthMap) -> tuple[Array, Array]:
+    """Return place (3,) in ned and covariance (3, 3); of an object half hidden, the middle of what is left is off."""
     covariance = measurement_covariance(sighting.p_rect, sighting.radius_m, _eyes(depth))
+    if sighting.covered >= COVERED:
+        hidden_m = 2.0 * radius_m * max(0.0, 1.0 - (sighting.radius_m / radius_m) ** 2)
+        covariance = covariance + np.diag([1.0, 1.0, 0.0]) * hidden_m**2
     return _to_ned(frame, sighting.p_rect), _in_ned(frame, covariance)
 
 

@@ -62,6 +62,7 @@ class Sighting:
 
     `alike` is the correlation of the patch between the eyes, `whole` whether it lies inside the image, `joined` how
     much the surroundings on both sides are as far away: a thing by itself has little of that, a piece of wall much.
+    `covered` is the share of the surroundings that is nearer and may hide a part of it.
     """
 
     mask: Mask
@@ -72,6 +73,7 @@ class Sighting:
     alike: float
     whole: bool
     joined: float
+    covered: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,12 +90,13 @@ class _Patch:
         return slice(self.top, self.top + height), slice(self.left, self.left + width)
 
 
-def sight(frame: Frame, expected: Expected) -> Sighting | None:
-    """Return the object as seen in `frame`, None when it is not where it is expected."""
+def sight(frame: Frame, expected: Expected, beyond_m: float = 0.0) -> Sighting | None:
+    """Return the object as seen in `frame`, None when it is not where it is expected; what is not farther away than
+    `beyond_m` is something else."""
     patch = _window(frame, expected)
     if patch is None:
         return None
-    mask = _own_pixels(frame, patch, expected)
+    mask = _own_pixels(frame, patch, expected, beyond_m)
     if mask is None:
         return None
     disparity, alike = _registered(frame, patch, mask)
@@ -120,7 +123,7 @@ def _window(frame: Frame, expected: Expected) -> _Patch | None:
     return _Patch(top, left, swept_depth(frame, box, max(0.3, 0.85 * z0 - margin_m), 2.5 * z0 + margin_m))
 
 
-def _own_pixels(frame: Frame, patch: _Patch, expected: Expected) -> Mask | None:
+def _own_pixels(frame: Frame, patch: _Patch, expected: Expected, beyond_m: float) -> Mask | None:
     """Return the pixels of the window that lie where the object should be, as one piece; None when they are too few.
 
     Whatever is seen around it is its background; where that lies clearly behind, a pixel is the object's when its
@@ -132,6 +135,7 @@ def _own_pixels(frame: Frame, patch: _Patch, expected: Expected) -> Mask | None:
     with np.errstate(invalid="ignore"):
         disparity_px = frame.bf_m_px / patch.depth_m
         as_far = np.abs(patch.depth_m - z0) < reach_m + 3.0 * expected.along_m + MATCH_PX * z0 / own_px
+        as_far &= patch.depth_m > beyond_m
     around = disparity_px[np.isfinite(disparity_px) & ~_disc(frame, patch, middle, z0, reach_m + slack_m)]
     behind_px = float(np.median(around)) if around.size else 0.0
     mask = np.asarray(as_far)
@@ -225,21 +229,22 @@ def _sighting(
     edge = bool(whole[0].any() or whole[-1].any() or whole[:, 0].any() or whole[:, -1].any())
     radius_m = float(np.sqrt(mask.sum() / np.pi)) * depth_m / frame.pinhole.f_px
     p_rect = frame.points(np.array([*uv, frame.bf_m_px / depth_m]))
-    joined = _joined(frame, patch, uv, depth_m, expected.radius_m)
-    return Sighting(whole, uv, depth_m, p_rect, radius_m, alike, not edge, joined)
+    joined, covered = _surroundings(frame, patch, uv, depth_m, expected.radius_m)
+    return Sighting(whole, uv, depth_m, p_rect, radius_m, alike, not edge, joined, covered)
 
 
-def _joined(frame: Frame, patch: _Patch, middle: Array, depth_m: float, radius_m: float) -> float:
-    """Return how much the object goes on, at its own depth, on both sides of itself: 0 a thing by itself, 1 a piece.
+def _surroundings(frame: Frame, patch: _Patch, middle: Array, depth_m: float, radius_m: float) -> tuple[float, float]:
+    """Return how much the object goes on, at its own depth, on both sides of itself: 0 a thing by itself, 1 a piece;
 
-    The ring around it is cut into sectors; of two that face each other the lesser share that is as far away as the
-    object counts (what lies outside the window is left out), and of all such pairs the greatest. A trunk goes on in
-    one direction alone, a wall in all, what stands on the ground only downwards.
+    and the share of what is around it that is nearer. The ring around it is cut into sectors; of two that face each
+    other the lesser share that is as far away as the object counts (what lies outside the window is left out), and of
+    all such pairs the greatest. A trunk goes on in one direction alone, a wall in all, what stands on the ground only
+    downwards.
     """
     ring = _disc(frame, patch, middle, depth_m, RING[1] * radius_m)
     ring &= ~_disc(frame, patch, middle, depth_m, RING[0] * radius_m)
     if not ring.any():
-        return 1.0
+        return 1.0, 0.0
     rows, columns = np.nonzero(ring)
     angle = np.arctan2(rows + patch.top - middle[1], columns + patch.left - middle[0])
     sector = np.rint(angle / (2.0 * np.pi / SECTORS)).astype(np.intp) % SECTORS
@@ -247,5 +252,6 @@ def _joined(frame: Frame, patch: _Patch, middle: Array, depth_m: float, radius_m
     with np.errstate(invalid="ignore", divide="ignore"):
         same = np.abs(patch.depth_m[ring] - depth_m) < radius_m + step_m
         share = np.bincount(sector, same, SECTORS) / np.bincount(sector, minlength=SECTORS)
+        covered = float(np.mean(patch.depth_m[ring] < depth_m - radius_m - step_m))
     lesser = np.fmin(share[: SECTORS // 2], share[SECTORS // 2 :])
-    return float(np.nanmax(lesser))
+    return float(np.nanmax(lesser)), covered
