@@ -37,8 +37,8 @@ MANY = 12
 STILL_S = 4.0
 """A track without any sign of own motion for so long is part of the scene."""
 
-GATE = 30.0
-"""Squared Mahalanobis length up to which a sighting belongs to the track."""
+GATE, LOST_GATE = 30.0, 12.0
+"""Squared Mahalanobis length up to which a sighting belongs to the track; the second when it was out of sight."""
 
 LARGEST_M, SMALLEST_M = 1.5, 0.04
 """Radii of what is taken for an object."""
@@ -137,11 +137,12 @@ class Finder:
 
     def _see(self, candidate: _Candidate, frame: Frame, depth: DepthMap, dt_s: float) -> None:
         candidate.filter.predict(dt_s)
+        lost = candidate.sighting is None
         sighting = candidate.sighting = self._sighted(candidate, frame)
         if sighting is None:
             return
         p_ned, covariance = _measured(sighting, candidate.radius_m, frame, depth)
-        if candidate.filter.surprise(p_ned, covariance) >= GATE:
+        if candidate.filter.surprise(p_ned, covariance) >= (LOST_GATE if lost else GATE):
             candidate.sighting = None
             return
         candidate.filter.update(p_ned, covariance)
