@@ -11,22 +11,21 @@ import contextlib
 import fcntl
 import hashlib
 import json
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from morpheyes_daemon.errors import InputError, UsageError
+from morpheyes_daemon.experiments.campaign_results import Results, draw_figures, results_of
 from morpheyes_daemon.experiments.flight import FlightPlan, Watchers, fly
 from morpheyes_daemon.experiments.flight_outputs import FlightOutputs
+from morpheyes_daemon.experiments.flight_table import Row
 from morpheyes_daemon.experiments.measures import measures_for
 from morpheyes_daemon.experiments.plan import hold, parse_baseline, with_seed
 from morpheyes_daemon.stereo.rig import RigModel
 
-Row = dict[str, Any]
 FLIGHTS = "flights.jsonl"
-SETTINGS = "campaign.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,20 +81,21 @@ def parse_seeds(text: str) -> tuple[int, ...]:
 
 def run_campaign(
     campaign: Campaign, folder: Path, jobs: int, scheduler: str | None, done: Callable[[Row, int, int], None]
-) -> list[Row]:
-    """Fly what is missing and return every row in the order of baselines and seeds.
+) -> Results:
+    """Fly what is missing, write what came of the whole, and return it in the order of baselines and seeds.
 
-    `done` hears of each new row, with how many there are of how many. Raises InputError when the folder belongs to
-    another campaign or one is running there, UsageError when the scheduler cannot be reached.
+    `done` hears of each new row, with how many there are of how many. Results of an earlier campaign in the folder
+    stay as they are until all flights are there. Raises InputError when the folder belongs to another campaign or one
+    is running there, UsageError when the scheduler cannot be reached.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with _lock(folder):
+        settings = campaign.settings()
         rows_file = folder / FLIGHTS
         rows = {(row["baseline_mode"], row["seed"]): row for row in _read(rows_file, campaign.key)}
         wanted = [(_mode(text), seed) for text in campaign.baselines for seed in campaign.seeds]
         missing = [pair for pair in wanted if pair not in rows]
         total, have = len(wanted), len(wanted) - len(missing)
-        (folder / SETTINGS).write_text(json.dumps(campaign.settings(), indent=2) + "\n", encoding="utf-8")
         with rows_file.open("a", encoding="utf-8") as file:
             for row in _fly_all(campaign, missing, folder, jobs, scheduler):
                 rows[row["baseline_mode"], row["seed"]] = row
@@ -103,24 +103,10 @@ def run_campaign(
                 file.flush()
                 have += 1
                 done(row, have, total)
-    return [rows[pair] for pair in wanted]
-
-
-def cells(rows: Sequence[Row]) -> list[Row]:
-    """Return one row per baseline: counts, success rate with its 95 % Wilson interval, speeds, clearance."""
-    modes = list(dict.fromkeys(row["baseline_mode"] for row in rows))
-    variable = {row["seed"]: row for row in rows if row["baseline_mode"] == "variable"}
-    return [_cell(mode, [row for row in rows if row["baseline_mode"] == mode], variable) for mode in modes]
-
-
-def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
-    """Return the Wilson score interval of a success rate; (0, 1) without trials."""
-    if trials == 0:
-        return 0.0, 1.0
-    p, n = successes / trials, trials
-    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, centre - half), min(1.0, centre + half)
+        results = results_of(campaign.plan, [rows[pair] for pair in wanted])
+        results.write(folder, settings)
+        draw_figures(campaign.plan, results.flights, folder)
+    return results
 
 
 def fly_one(plan: FlightPlan, key: str, folder: Path | None = None) -> Row:
@@ -134,55 +120,6 @@ def fly_one(plan: FlightPlan, key: str, folder: Path | None = None) -> Row:
     if outputs:
         outputs.finish(summary)
     return {**summary.as_json(), **(measures.row() if measures else {}), "campaign": key}
-
-
-def _cell(mode: str, rows: Sequence[Row], variable: dict[int, Row]) -> Row:
-    good = [row for row in rows if row["outcome"] == "reached"]
-    low, high = wilson(len(good), len(rows))
-    others = ("collided", "refused", "timeout", "aborted")
-    count = {name: sum(row["outcome"] == name for row in rows) for name in others}
-    causes: dict[str, int] = {}
-    for row in rows:
-        if row["outcome"] != "reached":
-            # no two collisions are alike
-            which = f"collided in seed {row['seed']}" if row["outcome"] == "collided" else row["outcome"]
-            cause = f"{which}: {row['reason']}"
-            causes[cause] = causes.get(cause, 0) + 1
-    return {
-        "baseline_mode": mode,
-        "flights": len(rows),
-        "reached": len(good),
-        **count,
-        "success_rate": round(len(good) / len(rows), 4) if rows else 0.0,
-        "success_low": round(low, 4),
-        "success_high": round(high, 4),
-        "mean_speed_m_s": _mean(good, "mean_speed_m_s"),
-        "peak_speed_m_s": max((row["peak_speed_m_s"] for row in rows), default=None),
-        "mean_time_s": _mean(good, "time_s"),
-        "min_clearance_m": min((row["min_clearance_m"] for row in rows), default=None),
-        "braking_events": sum(row["braking_events"] for row in rows),
-        "speed_ratio_to_variable": _ratio(good, variable),
-        "causes": causes,
-    }
-
-
-def _mean(rows: Sequence[Row], key: str) -> float | None:
-    return round(sum(row[key] for row in rows) / len(rows), 4) if rows else None
-
-
-def _ratio(rows: Sequence[Row], variable: dict[int, Row]) -> list[float] | None:
-    """Variable speed over this baseline's, flight by flight of the same seed: mean and its 95 % interval."""
-    pairs = [
-        variable[row["seed"]]["mean_speed_m_s"] / row["mean_speed_m_s"]
-        for row in rows
-        if row["seed"] in variable and variable[row["seed"]]["outcome"] == "reached"
-    ]
-    if not pairs:
-        return None
-    mean = sum(pairs) / len(pairs)
-    spread = math.sqrt(sum((x - mean) ** 2 for x in pairs) / max(1, len(pairs) - 1))
-    half = 1.96 * spread / math.sqrt(len(pairs))
-    return [round(mean, 3), round(mean - half, 3), round(mean + half, 3)]
 
 
 def _mode(text: str) -> str:
