@@ -41,10 +41,12 @@ def command(
     from morpheyes_daemon.cli.progress import progress_line
 
     require_simulator()
-    from morpheyes_daemon.experiments.campaign import Campaign, parse_seeds, run_campaign
+    from morpheyes_daemon.experiments.campaign import Campaign, parse_baselines, parse_seeds, require_jobs, run_campaign
     from morpheyes_daemon.experiments.campaign_results import RESULTS
     from morpheyes_daemon.experiments.plan import make_plan
 
+    modes, numbers = parse_baselines(baselines), parse_seeds(seeds)
+    require_jobs(jobs)
     with progress_line() as report:
         plan = make_plan(
             mission,
@@ -59,7 +61,7 @@ def command(
             limit_s=limit_s,
             progress=report,
         )
-        campaign = Campaign(plan, tuple(baselines.split(",")), parse_seeds(seeds))
+        campaign = Campaign(plan, modes, numbers)
         folder = out or Path("out") / f"experiment-{plan.mission_name}"
 
         def done(row: Row, have: int, total: int) -> None:

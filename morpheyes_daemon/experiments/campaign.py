@@ -1,8 +1,8 @@
 """Many flights: every seed at every baseline, on one machine or on a Dask scheduler, resumable.
 
 Each finished flight is one line of `flights.jsonl`; a campaign started again in the same folder flies only what is
-missing. Flights are independent and indexed by seed, so the order in which they end does not matter. The first seed
-of every baseline leaves log, map, strips and film.
+missing. Flights are independent and indexed by seed, so the order in which they end does not matter, and one that
+cannot be flown keeps none of the others from it. The first seed of every baseline leaves log, map, strips and film.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from morpheyes_daemon.errors import InputError, UsageError
+from morpheyes_daemon.errors import InputError, MorphEyesError, UsageError, mistake
 from morpheyes_daemon.experiments.campaign_results import Results, draw_figures, results_of
 from morpheyes_daemon.experiments.flight import FlightPlan, Watchers, fly
 from morpheyes_daemon.experiments.flight_outputs import FlightOutputs
 from morpheyes_daemon.experiments.flight_table import Row
 from morpheyes_daemon.experiments.measures import measures_for
 from morpheyes_daemon.experiments.plan import hold, parse_baseline, with_seed
+from morpheyes_daemon.simulation.worlds import load_world
 from morpheyes_daemon.stereo.rig import RigModel
 
 FLIGHTS = "flights.jsonl"
@@ -30,7 +31,7 @@ FLIGHTS = "flights.jsonl"
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """What is flown: `plan` with every baseline ('variable' or metres as text) and every seed."""
+    """What is flown: `plan` with every baseline ('variable' or metres, as `parse_baselines` has it) and every seed."""
 
     plan: FlightPlan
     baselines: tuple[str, ...]
@@ -46,6 +47,7 @@ class Campaign:
             plan.config.model_dump_json(),
             hashlib.sha256(plan.calibration.read_bytes()).hexdigest(),
             repr(replace(plan.scenario, seed=0)),
+            load_world(plan.scenario.world).model_dump_json(exclude={"description"}),
             repr(plan.limit_s),
         )
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
@@ -79,6 +81,35 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     raise UsageError(f"--seeds {text}: give one seed or a range such as 0-39 (both ends are flown).")
 
 
+def parse_baselines(text: str) -> tuple[str, ...]:
+    """Return the baselines of a list such as 'variable,0.1,0.20' as rows name them; raises UsageError."""
+    baselines: list[str] = []
+    for item in text.split(","):
+        if not item.strip():
+            raise UsageError(f"--baselines {text}: an item is empty; give for instance variable,0.1.")
+        metres = parse_baseline(item.strip())
+        baseline = "variable" if metres is None else f"{metres:g}"
+        if baseline in baselines:
+            raise UsageError(f"--baselines {text}: {baseline} is there twice, but is flown once.")
+        baselines.append(baseline)
+    return tuple(baselines)
+
+
+def require_jobs(jobs: int) -> None:
+    """Refuse a number of flights at once that cannot be flown; raises UsageError."""
+    if jobs < 1 and jobs != -1:
+        raise UsageError(f"--jobs {jobs}: give how many flights to fly at once, or -1 for one per core.")
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A flight that could not be flown, and what was raised."""
+
+    baseline_mode: str
+    seed: int
+    text: str
+
+
 def run_campaign(
     campaign: Campaign, folder: Path, jobs: int, scheduler: str | None, done: Callable[[Row, int, int], None]
 ) -> Results:
@@ -86,23 +117,30 @@ def run_campaign(
 
     `done` hears of each new row, with how many there are of how many. Results of an earlier campaign in the folder
     stay as they are until all flights are there. Raises InputError when the folder belongs to another campaign or one
-    is running there, UsageError when the scheduler cannot be reached.
+    is running there, UsageError when the scheduler cannot be reached, and MorphEyesError, once all others have been
+    flown and kept, when there are flights that cannot.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with _lock(folder):
-        settings = campaign.settings()
+        key, settings = campaign.key, campaign.settings()
         rows_file = folder / FLIGHTS
-        rows = {(row["baseline_mode"], row["seed"]): row for row in _read(rows_file, campaign.key)}
-        wanted = [(_mode(text), seed) for text in campaign.baselines for seed in campaign.seeds]
+        rows = {(row["baseline_mode"], row["seed"]): row for row in _read(rows_file, key)}
+        wanted = [(mode, seed) for mode in campaign.baselines for seed in campaign.seeds]
         missing = [pair for pair in wanted if pair not in rows]
-        total, have = len(wanted), len(wanted) - len(missing)
+        have = len(wanted) - len(missing)
+        failures: list[Failure] = []
         with rows_file.open("a", encoding="utf-8") as file:
-            for row in _fly_all(campaign, missing, folder, jobs, scheduler):
-                rows[row["baseline_mode"], row["seed"]] = row
-                file.write(json.dumps(row) + "\n")
+            for flown in _fly_all(campaign, missing, key, folder, jobs, scheduler):
+                if isinstance(flown, Failure):
+                    failures.append(flown)
+                    continue
+                rows[flown["baseline_mode"], flown["seed"]] = flown
+                file.write(json.dumps(flown) + "\n")
                 file.flush()
                 have += 1
-                done(row, have, total)
+                done(flown, have, len(wanted))
+        if failures:
+            raise MorphEyesError(_told(failures, len(wanted)))
         results = results_of(campaign.plan, [rows[pair] for pair in wanted])
         results.write(folder, settings)
         draw_figures(campaign.plan, results.flights, folder)
@@ -122,9 +160,11 @@ def fly_one(plan: FlightPlan, key: str, folder: Path | None = None) -> Row:
     return {**summary.as_json(), **(measures.row() if measures else {}), "campaign": key}
 
 
-def _mode(text: str) -> str:
-    metres = parse_baseline(text)
-    return "variable" if metres is None else f"{metres:g}"
+def _try_one(mode: str, plan: FlightPlan, key: str, folder: Path | None = None) -> Row | Failure:
+    try:
+        return fly_one(plan, key, folder)
+    except Exception as error:  # noqa: BLE001 -- the worker's task boundary
+        return Failure(mode, plan.scenario.seed, mistake(error))
 
 
 def _plan(campaign: Campaign, mode: str, seed: int) -> FlightPlan:
@@ -133,19 +173,18 @@ def _plan(campaign: Campaign, mode: str, seed: int) -> FlightPlan:
 
 
 def _fly_all(
-    campaign: Campaign, pairs: Sequence[tuple[str, int]], folder: Path, jobs: int, scheduler: str | None
-) -> Iterator[Row]:
+    campaign: Campaign, pairs: Sequence[tuple[str, int]], key: str, folder: Path, jobs: int, scheduler: str | None
+) -> Iterator[Row | Failure]:
     """Fly; the first seed of every baseline leaves its pictures, when this machine does the flying."""
+    plans = [(mode, _plan(campaign, mode, seed)) for mode, seed in pairs]
+    if not plans:
+        return
     import joblib
 
     def pictures(mode: str, seed: int) -> Path | None:
         return folder / f"{mode}-{seed}" if seed == campaign.seeds[0] and scheduler is None else None
 
-    calls = [
-        joblib.delayed(fly_one)(_plan(campaign, mode, seed), campaign.key, pictures(mode, seed)) for mode, seed in pairs
-    ]
-    if not calls:
-        return
+    calls = [joblib.delayed(_try_one)(mode, plan, key, pictures(mode, plan.scenario.seed)) for mode, plan in plans]
     with _backend(scheduler):
         count = -1 if scheduler else jobs
         yield from joblib.Parallel(n_jobs=count, return_as="generator_unordered")(calls)
@@ -168,6 +207,21 @@ def _backend(scheduler: str | None) -> Iterator[None]:
         raise UsageError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error}).") from None
     with client, joblib.parallel_config("dask"):
         yield
+
+
+def _told(failures: Sequence[Failure], total: int) -> str:
+    """Return one sentence that names every flight that failed, those that failed in the same way together."""
+    alike: dict[tuple[str, str], list[int]] = {}
+    for failure in sorted(failures, key=lambda failure: failure.seed):
+        alike.setdefault((failure.baseline_mode, failure.text), []).append(failure.seed)
+    named = [
+        f"{mode}, seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}: {text}"
+        for (mode, text), seeds in alike.items()
+    ]
+    return (
+        f"{len(failures)} of {total} flights could not be flown: {'; '.join(named)}; "
+        "they are tried again when the campaign is started again."
+    )
 
 
 @contextlib.contextmanager

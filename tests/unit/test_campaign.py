@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from morpheyes_daemon.errors import InputError, UsageError
+from morpheyes_daemon.cli import main
+from morpheyes_daemon.errors import InputError, MorphEyesError, UsageError
 from morpheyes_daemon.experiments import campaign as campaigns
-from morpheyes_daemon.experiments.campaign import FLIGHTS, Campaign, parse_seeds, run_campaign
+from morpheyes_daemon.experiments import plan as plans
+from morpheyes_daemon.experiments.campaign import (
+    FLIGHTS,
+    Campaign,
+    parse_baselines,
+    parse_seeds,
+    require_jobs,
+    run_campaign,
+)
 from morpheyes_daemon.experiments.campaign_results import RESULTS, SETTINGS, TABLE, Results
 from morpheyes_daemon.experiments.flight import FlightPlan
 from morpheyes_daemon.experiments.flight_table import Row
@@ -167,6 +177,41 @@ def test_another_campaign_s_folder_is_left_alone(campaign: Campaign, sky: Sky, t
     assert (tmp_path / FLIGHTS).read_bytes() == before
 
 
+def test_a_world_that_was_edited_makes_another_campaign_and_its_description_does_not(sky: Sky, tmp_path: Path) -> None:
+    world = tmp_path / "my.yaml"
+    world.write_text("world: {kind: forest, trees_per_ha: 100}\n")
+    plan = make_plan("forest", size="160x120", calibration="exact", world=str(world))
+    campaign = Campaign(plan, ("variable",), (0,))
+    fly(campaign, tmp_path / "out")
+    world.write_text("description: mine\nworld: {kind: forest, trees_per_ha: 100}\n")
+    fly(campaign, tmp_path / "out")
+    for edited in ("world: {kind: forest, trees_per_ha: 200}\n", world.read_text() + "light: {sun: 0.5}\n"):
+        world.write_text(edited)
+        with pytest.raises(InputError, match="another campaign"):
+            fly(campaign, tmp_path / "out")
+
+
+def test_a_flight_that_cannot_be_flown_is_named_when_all_others_have_been(
+    campaign: Campaign, sky: Sky, tmp_path: Path
+) -> None:
+    sky.raising = {
+        ("variable", 0): ValueError("no such tree"),
+        ("variable", 2): ValueError("no such tree"),
+        ("0.2", 1): InputError("the picture is black."),
+    }
+    with pytest.raises(MorphEyesError) as raised:
+        fly(campaign, tmp_path)
+    said = str(raised.value)
+    assert said.startswith("3 of 6 flights could not be flown: variable, seeds 0, 2: ValueError: no such tree (test_c")
+    assert "; 0.2, seed 1: InputError: the picture is black. (test_campaign.py:" in said
+    assert said.endswith("; they are tried again when the campaign is started again.")
+    assert (len(sky.flights), contents(tmp_path)) == (6, [None] * 3)
+    sky.raising.clear()
+    results = fly(campaign, tmp_path)
+    assert sorted(sky.flights[6:]) == [("0.2", 1), ("variable", 0), ("variable", 2)]
+    assert flights_of(results) == [(mode, seed) for mode in ("variable", "0.2") for seed in range(3)]
+
+
 def test_a_file_that_holds_no_flights_is_named_with_its_line(campaign: Campaign, tmp_path: Path) -> None:
     (tmp_path / FLIGHTS).write_text("not a flight\n{}\n")
     with pytest.raises(InputError, match=r"flights\.jsonl:1"):
@@ -179,3 +224,32 @@ def test_seeds_are_a_number_or_a_range_with_both_ends() -> None:
     for wrong in ("", "5-3", "a", "-1", "1-", "1,2"):
         with pytest.raises(UsageError, match="--seeds"):
             parse_seeds(wrong)
+
+
+def test_baselines_are_told_as_rows_name_them_and_none_twice() -> None:
+    assert parse_baselines("variable, 0.10,0.2") == ("variable", "0.1", "0.2")
+    for wrong, why in (
+        ("variable,variable", "variable is there twice"), ("0.1,0.2,0.10", "0.1 is there twice"),
+        ("variable,", "an item is empty"), ("", "an item is empty"), ("wide", "give 'variable' or a length"),
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=why):
+            parse_baselines(wrong)
+
+
+@pytest.mark.parametrize("option", ["--jobs=0", "--jobs=-2", "--baselines=0.1,0.10", "--seeds=3-1"])
+def test_a_wrong_option_is_one_sentence_before_anything_is_made(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(plans, "make_plan", lambda *_, **__: pytest.fail("it was planned"))
+    monkeypatch.setattr(sys, "argv", ["morpheyes", "experiment", "forest", option, "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr().err
+    assert (ended.value.code, said.count("\n")) == (2, 1)
+    assert option.replace("=", " ") in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_any_number_of_flights_at_once_and_one_per_core_are_allowed() -> None:
+    for jobs in (-1, 1, 40):
+        require_jobs(jobs)
