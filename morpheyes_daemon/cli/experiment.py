@@ -21,7 +21,9 @@ def command(
     rate_hz: Annotated[float, typer.Option(min=0.2, max=60.0, help="Stereo pairs per second.")] = 5.0,
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "320x240",
     jobs: Annotated[int, typer.Option(help="Flights at once; -1: one per core.")] = -1,
-    scheduler: Annotated[str | None, typer.Option(help="A running Dask scheduler, tcp://HOST:PORT.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Fly on a running Dask scheduler, tcp://HOST:PORT; no pictures are made then.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder; a campaign found there is continued.")] = None,
     config: Annotated[Path | None, typer.Option(help="Vehicle configuration.")] = None,
     calibration: Annotated[

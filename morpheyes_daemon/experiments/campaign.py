@@ -14,6 +14,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from morpheyes_daemon.errors import InputError, MorphEyesError, UsageError, mistake
@@ -167,6 +168,24 @@ def _try_one(mode: str, plan: FlightPlan, key: str, folder: Path | None = None) 
         return Failure(mode, plan.scenario.seed, mistake(error))
 
 
+def _try_elsewhere(mode: str, plan: FlightPlan, key: str, calibration: str, world: str | None) -> Row | Failure:
+    """Fly on a machine that has none of our files: calibration and, unless it is a shipped one, world come as text."""
+    with TemporaryDirectory(prefix="morpheyes-") as name:
+        here = replace(plan, calibration=Path(name) / "calibration.yaml")
+        here.calibration.write_text(calibration, encoding="utf-8")
+        if world is not None:
+            (Path(name) / "world.yaml").write_text(world, encoding="utf-8")
+            here = replace(here, scenario=replace(plan.scenario, world=f"{name}/world.yaml"))
+        flown = _try_one(mode, here, key)
+    return flown if isinstance(flown, Failure) else {**flown, "world": plan.scenario.world}
+
+
+def _texts(plan: FlightPlan) -> tuple[str, str | None]:
+    """Return the text of a plan's calibration file, and of its world where that is a file."""
+    world = Path(plan.scenario.world)
+    return plan.calibration.read_text(encoding="utf-8"), world.read_text(encoding="utf-8") if world.is_file() else None
+
+
 def _plan(campaign: Campaign, mode: str, seed: int) -> FlightPlan:
     plan = with_seed(campaign.plan, seed)
     return replace(plan, config=hold(plan.config, parse_baseline(mode)))
@@ -179,34 +198,40 @@ def _fly_all(
     plans = [(mode, _plan(campaign, mode, seed)) for mode, seed in pairs]
     if not plans:
         return
-    import joblib
-
-    def pictures(mode: str, seed: int) -> Path | None:
-        return folder / f"{mode}-{seed}" if seed == campaign.seeds[0] and scheduler is None else None
-
-    calls = [joblib.delayed(_try_one)(mode, plan, key, pictures(mode, plan.scenario.seed)) for mode, plan in plans]
-    with _backend(scheduler):
-        count = -1 if scheduler else jobs
-        yield from joblib.Parallel(n_jobs=count, return_as="generator_unordered")(calls)
-
-
-@contextlib.contextmanager
-def _backend(scheduler: str | None) -> Iterator[None]:
-    if scheduler is None:
-        yield
+    if scheduler is not None:
+        yield from _fly_on(scheduler, plans, key)
         return
     import joblib
 
+    def pictures(mode: str, seed: int) -> Path | None:
+        return folder / f"{mode}-{seed}" if seed == campaign.seeds[0] else None
+
+    calls = [joblib.delayed(_try_one)(mode, plan, key, pictures(mode, plan.scenario.seed)) for mode, plan in plans]
+    yield from joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
+
+
+def _fly_on(scheduler: str, plans: Sequence[tuple[str, FlightPlan]], key: str) -> Iterator[Row | Failure]:
+    """Fly on the workers of a Dask scheduler, in the order in which they get ready."""
     try:
-        from distributed import Client
+        from distributed import Client, as_completed
     except ImportError:
         raise UsageError("--scheduler needs the campaign extra: pip install 'morpheyes-daemon[campaign]'.") from None
     try:
         client: Any = Client(scheduler, timeout="10s")  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise UsageError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error}).") from None
-    with client, joblib.parallel_config("dask"):
-        yield
+    with client:
+        flights = {}
+        for mode, plan in plans:
+            flight = client.submit(_try_elsewhere, mode, plan, key, *_texts(plan), pure=False)
+            flights[flight] = mode, plan.scenario.seed
+        for flight in as_completed(flights):  # type: ignore[no-untyped-call]
+            try:
+                flown = flight.result()
+            except Exception as error:  # noqa: BLE001 -- whatever became of a worker
+                flown = Failure(*flights[flight], f"{type(error).__name__}: {error}")
+            flight.release()  # or a worker that dies has all that it ever flew flown again
+            yield flown
 
 
 def _told(failures: Sequence[Failure], total: int) -> str:
