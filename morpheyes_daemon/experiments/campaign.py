@@ -1,8 +1,8 @@
 """Many flights: every seed at every baseline, on one machine or on a Dask scheduler, resumable.
 
 Each finished flight is one line of `flights.jsonl`; a campaign started again in the same folder flies only what is
-missing. Flights are independent and indexed by seed, so the order in which they end does not matter. The first seed
-of every baseline leaves log, map, strips and film.
+missing. Flights are independent and indexed by seed, so the order in which they end does not matter, and one that
+cannot be flown keeps none of the others from it. The first seed of every baseline leaves log, map, strips and film.
 """
 
 from __future__ import annotations
@@ -11,27 +11,28 @@ import contextlib
 import fcntl
 import hashlib
 import json
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from morpheyes_daemon.errors import InputError, UsageError
+from morpheyes_daemon.errors import InputError, MorphEyesError, UsageError, mistake
+from morpheyes_daemon.experiments.campaign_results import Results, draw_figures, results_of
 from morpheyes_daemon.experiments.flight import FlightPlan, Watchers, fly
 from morpheyes_daemon.experiments.flight_outputs import FlightOutputs
+from morpheyes_daemon.experiments.flight_table import Row
 from morpheyes_daemon.experiments.measures import measures_for
 from morpheyes_daemon.experiments.plan import hold, parse_baseline, with_seed
+from morpheyes_daemon.simulation.worlds import load_world
 from morpheyes_daemon.stereo.rig import RigModel
 
-Row = dict[str, Any]
 FLIGHTS = "flights.jsonl"
-SETTINGS = "campaign.json"
 
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """What is flown: `plan` with every baseline ('variable' or metres as text) and every seed."""
+    """What is flown: `plan` with every baseline ('variable' or metres, as `parse_baselines` has it) and every seed."""
 
     plan: FlightPlan
     baselines: tuple[str, ...]
@@ -47,6 +48,7 @@ class Campaign:
             plan.config.model_dump_json(),
             hashlib.sha256(plan.calibration.read_bytes()).hexdigest(),
             repr(replace(plan.scenario, seed=0)),
+            load_world(plan.scenario.world).model_dump_json(exclude={"description"}),
             repr(plan.limit_s),
         )
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
@@ -80,47 +82,70 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     raise UsageError(f"--seeds {text}: give one seed or a range such as 0-39 (both ends are flown).")
 
 
+def parse_baselines(text: str) -> tuple[str, ...]:
+    """Return the baselines of a list such as 'variable,0.1,0.20' as rows name them; raises UsageError."""
+    baselines: list[str] = []
+    for item in text.split(","):
+        if not item.strip():
+            raise UsageError(f"--baselines {text}: an item is empty; give for instance variable,0.1.")
+        metres = parse_baseline(item.strip())
+        baseline = "variable" if metres is None else f"{metres:g}"
+        if baseline in baselines:
+            raise UsageError(f"--baselines {text}: {baseline} is there twice, but is flown once.")
+        baselines.append(baseline)
+    return tuple(baselines)
+
+
+def require_jobs(jobs: int) -> None:
+    """Refuse a number of flights at once that cannot be flown; raises UsageError."""
+    if jobs < 1 and jobs != -1:
+        raise UsageError(f"--jobs {jobs}: give how many flights to fly at once, or -1 for one per core.")
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A flight that could not be flown, and what was raised."""
+
+    baseline_mode: str
+    seed: int
+    text: str
+
+
 def run_campaign(
     campaign: Campaign, folder: Path, jobs: int, scheduler: str | None, done: Callable[[Row, int, int], None]
-) -> list[Row]:
-    """Fly what is missing and return every row in the order of baselines and seeds.
+) -> Results:
+    """Fly what is missing, write what came of the whole, and return it in the order of baselines and seeds.
 
-    `done` hears of each new row, with how many there are of how many. Raises InputError when the folder belongs to
-    another campaign or one is running there, UsageError when the scheduler cannot be reached.
+    `done` hears of each new row, with how many there are of how many. Results of an earlier campaign in the folder
+    stay as they are until all flights are there. Raises InputError when the folder belongs to another campaign or one
+    is running there, UsageError when the scheduler cannot be reached, and MorphEyesError, once all others have been
+    flown and kept, when there are flights that cannot.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with _lock(folder):
+        key, settings = campaign.key, campaign.settings()
         rows_file = folder / FLIGHTS
-        rows = {(row["baseline_mode"], row["seed"]): row for row in _read(rows_file, campaign.key)}
-        wanted = [(_mode(text), seed) for text in campaign.baselines for seed in campaign.seeds]
+        rows = {(row["baseline_mode"], row["seed"]): row for row in _read(rows_file, key)}
+        wanted = [(mode, seed) for mode in campaign.baselines for seed in campaign.seeds]
         missing = [pair for pair in wanted if pair not in rows]
-        total, have = len(wanted), len(wanted) - len(missing)
-        (folder / SETTINGS).write_text(json.dumps(campaign.settings(), indent=2) + "\n", encoding="utf-8")
+        have = len(wanted) - len(missing)
+        failures: list[Failure] = []
         with rows_file.open("a", encoding="utf-8") as file:
-            for row in _fly_all(campaign, missing, folder, jobs, scheduler):
-                rows[row["baseline_mode"], row["seed"]] = row
-                file.write(json.dumps(row) + "\n")
+            for flown in _fly_all(campaign, missing, key, folder, jobs, scheduler):
+                if isinstance(flown, Failure):
+                    failures.append(flown)
+                    continue
+                rows[flown["baseline_mode"], flown["seed"]] = flown
+                file.write(json.dumps(flown) + "\n")
                 file.flush()
                 have += 1
-                done(row, have, total)
-    return [rows[pair] for pair in wanted]
-
-
-def cells(rows: Sequence[Row]) -> list[Row]:
-    """Return one row per baseline: counts, success rate with its 95 % Wilson interval, speeds, clearance."""
-    modes = list(dict.fromkeys(row["baseline_mode"] for row in rows))
-    variable = {row["seed"]: row for row in rows if row["baseline_mode"] == "variable"}
-    return [_cell(mode, [row for row in rows if row["baseline_mode"] == mode], variable) for mode in modes]
-
-
-def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
-    """Return the Wilson score interval of a success rate; (0, 1) without trials."""
-    if trials == 0:
-        return 0.0, 1.0
-    p, n = successes / trials, trials
-    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, centre - half), min(1.0, centre + half)
+                done(flown, have, len(wanted))
+        if failures:
+            raise MorphEyesError(_told(failures, len(wanted)))
+        results = results_of(campaign.plan, [rows[pair] for pair in wanted])
+        results.write(folder, settings)
+        draw_figures(campaign.plan, results.flights, folder)
+    return results
 
 
 def fly_one(plan: FlightPlan, key: str, folder: Path | None = None) -> Row:
@@ -136,58 +161,29 @@ def fly_one(plan: FlightPlan, key: str, folder: Path | None = None) -> Row:
     return {**summary.as_json(), **(measures.row() if measures else {}), "campaign": key}
 
 
-def _cell(mode: str, rows: Sequence[Row], variable: dict[int, Row]) -> Row:
-    good = [row for row in rows if row["outcome"] == "reached"]
-    low, high = wilson(len(good), len(rows))
-    others = ("collided", "refused", "timeout", "aborted")
-    count = {name: sum(row["outcome"] == name for row in rows) for name in others}
-    causes: dict[str, int] = {}
-    for row in rows:
-        if row["outcome"] != "reached":
-            # no two collisions are alike
-            which = f"collided in seed {row['seed']}" if row["outcome"] == "collided" else row["outcome"]
-            cause = f"{which}: {row['reason']}"
-            causes[cause] = causes.get(cause, 0) + 1
-    return {
-        "baseline_mode": mode,
-        "flights": len(rows),
-        "reached": len(good),
-        **count,
-        "success_rate": round(len(good) / len(rows), 4) if rows else 0.0,
-        "success_low": round(low, 4),
-        "success_high": round(high, 4),
-        "mean_speed_m_s": _mean(good, "mean_speed_m_s"),
-        "peak_speed_m_s": max((row["peak_speed_m_s"] for row in rows), default=None),
-        "mean_time_s": _mean(good, "time_s"),
-        "min_clearance_m": min((row["min_clearance_m"] for row in rows), default=None),
-        "braking_events": sum(row["braking_events"] for row in rows),
-        "speed_ratio_to_variable": _ratio(good, variable),
-        "causes": causes,
-    }
+def _try_one(mode: str, plan: FlightPlan, key: str, folder: Path | None = None) -> Row | Failure:
+    try:
+        return fly_one(plan, key, folder)
+    except Exception as error:  # noqa: BLE001 -- the worker's task boundary
+        return Failure(mode, plan.scenario.seed, mistake(error))
 
 
-def _mean(rows: Sequence[Row], key: str) -> float | None:
-    return round(sum(row[key] for row in rows) / len(rows), 4) if rows else None
+def _try_elsewhere(mode: str, plan: FlightPlan, key: str, calibration: str, world: str | None) -> Row | Failure:
+    """Fly on a machine that has none of our files: calibration and, unless it is a shipped one, world come as text."""
+    with TemporaryDirectory(prefix="morpheyes-") as name:
+        here = replace(plan, calibration=Path(name) / "calibration.yaml")
+        here.calibration.write_text(calibration, encoding="utf-8")
+        if world is not None:
+            (Path(name) / "world.yaml").write_text(world, encoding="utf-8")
+            here = replace(here, scenario=replace(plan.scenario, world=f"{name}/world.yaml"))
+        flown = _try_one(mode, here, key)
+    return flown if isinstance(flown, Failure) else {**flown, "world": plan.scenario.world}
 
 
-def _ratio(rows: Sequence[Row], variable: dict[int, Row]) -> list[float] | None:
-    """Variable speed over this baseline's, flight by flight of the same seed: mean and its 95 % interval."""
-    pairs = [
-        variable[row["seed"]]["mean_speed_m_s"] / row["mean_speed_m_s"]
-        for row in rows
-        if row["seed"] in variable and variable[row["seed"]]["outcome"] == "reached"
-    ]
-    if not pairs:
-        return None
-    mean = sum(pairs) / len(pairs)
-    spread = math.sqrt(sum((x - mean) ** 2 for x in pairs) / max(1, len(pairs) - 1))
-    half = 1.96 * spread / math.sqrt(len(pairs))
-    return [round(mean, 3), round(mean - half, 3), round(mean + half, 3)]
-
-
-def _mode(text: str) -> str:
-    metres = parse_baseline(text)
-    return "variable" if metres is None else f"{metres:g}"
+def _texts(plan: FlightPlan) -> tuple[str, str | None]:
+    """Return the text of a plan's calibration file, and of its world where that is a file."""
+    world = Path(plan.scenario.world)
+    return plan.calibration.read_text(encoding="utf-8"), world.read_text(encoding="utf-8") if world.is_file() else None
 
 
 def _plan(campaign: Campaign, mode: str, seed: int) -> FlightPlan:
@@ -196,41 +192,61 @@ def _plan(campaign: Campaign, mode: str, seed: int) -> FlightPlan:
 
 
 def _fly_all(
-    campaign: Campaign, pairs: Sequence[tuple[str, int]], folder: Path, jobs: int, scheduler: str | None
-) -> Iterator[Row]:
+    campaign: Campaign, pairs: Sequence[tuple[str, int]], key: str, folder: Path, jobs: int, scheduler: str | None
+) -> Iterator[Row | Failure]:
     """Fly; the first seed of every baseline leaves its pictures, when this machine does the flying."""
+    plans = [(mode, _plan(campaign, mode, seed)) for mode, seed in pairs]
+    if not plans:
+        return
+    if scheduler is not None:
+        yield from _fly_on(scheduler, plans, key)
+        return
     import joblib
 
     def pictures(mode: str, seed: int) -> Path | None:
-        return folder / f"{mode}-{seed}" if seed == campaign.seeds[0] and scheduler is None else None
+        return folder / f"{mode}-{seed}" if seed == campaign.seeds[0] else None
 
-    calls = [
-        joblib.delayed(fly_one)(_plan(campaign, mode, seed), campaign.key, pictures(mode, seed)) for mode, seed in pairs
-    ]
-    if not calls:
-        return
-    with _backend(scheduler):
-        count = -1 if scheduler else jobs
-        yield from joblib.Parallel(n_jobs=count, return_as="generator_unordered")(calls)
+    calls = [joblib.delayed(_try_one)(mode, plan, key, pictures(mode, plan.scenario.seed)) for mode, plan in plans]
+    yield from joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
 
 
-@contextlib.contextmanager
-def _backend(scheduler: str | None) -> Iterator[None]:
-    if scheduler is None:
-        yield
-        return
-    import joblib
-
+def _fly_on(scheduler: str, plans: Sequence[tuple[str, FlightPlan]], key: str) -> Iterator[Row | Failure]:
+    """Fly on the workers of a Dask scheduler, in the order in which they get ready."""
     try:
-        from distributed import Client
+        from distributed import Client, as_completed
     except ImportError:
         raise UsageError("--scheduler needs the campaign extra: pip install 'morpheyes-daemon[campaign]'.") from None
     try:
         client: Any = Client(scheduler, timeout="10s")  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise UsageError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error}).") from None
-    with client, joblib.parallel_config("dask"):
-        yield
+    with client:
+        flights = {}
+        for mode, plan in plans:
+            flight = client.submit(_try_elsewhere, mode, plan, key, *_texts(plan), pure=False)
+            flights[flight] = mode, plan.scenario.seed
+        for flight in as_completed(flights):  # type: ignore[no-untyped-call]
+            try:
+                flown = flight.result()
+            except Exception as error:  # noqa: BLE001 -- whatever became of a worker
+                flown = Failure(*flights[flight], f"{type(error).__name__}: {error}")
+            flight.release()  # or a worker that dies has all that it ever flew flown again
+            yield flown
+
+
+def _told(failures: Sequence[Failure], total: int) -> str:
+    """Return one sentence that names every flight that failed, those that failed in the same way together."""
+    alike: dict[tuple[str, str], list[int]] = {}
+    for failure in sorted(failures, key=lambda failure: failure.seed):
+        alike.setdefault((failure.baseline_mode, failure.text), []).append(failure.seed)
+    named = [
+        f"{mode}, seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}: {text}"
+        for (mode, text), seeds in alike.items()
+    ]
+    return (
+        f"{len(failures)} of {total} flights could not be flown: {'; '.join(named)}; "
+        "they are tried again when the campaign is started again."
+    )
 
 
 @contextlib.contextmanager

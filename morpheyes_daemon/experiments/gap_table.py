@@ -7,29 +7,34 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.experiments.campaign import Row, wilson
+from morpheyes_daemon.experiments.flight_table import Row, cause_lines, causes, shown_rate, success
 
 
-def gap_cells(rows: Sequence[Row]) -> list[Row]:
-    """Return one cell for every baseline and motion, over all shapes and for each."""
+def gap_cells(rows: Sequence[Row], to_refuse: bool = False) -> list[Row]:
+    """Return one cell for every baseline and motion, over all shapes and for each.
+
+    `to_refuse` says that no opening is large enough: what is wanted then is a refusal, and success counts these.
+    """
+    wanted = "refused" if to_refuse else "reached"
     cells = []
     groups = dict.fromkeys((row["baseline_mode"], row["motion"]) for row in rows)
     for mode, motion in groups:
         group = [row for row in rows if (row["baseline_mode"], row["motion"]) == (mode, motion)]
-        shapes = list(dict.fromkeys(row["shape"] for row in group))
-        cells.append(_cell(mode, motion, "all", group))
+        shapes = sorted({row["shape"] for row in group})
+        parts = {"all": group}
         if len(shapes) > 1:
-            cells += [_cell(mode, motion, s, [row for row in group if row["shape"] == s]) for s in sorted(shapes)]
+            parts |= {shape: [row for row in group if row["shape"] == shape] for shape in shapes}
+        cells += [_cell(mode, motion, shape, part, wanted) for shape, part in parts.items()]
     return cells
 
 
 def gap_table(cells: Sequence[Row]) -> str:
-    """Return the cells as a Markdown table."""
+    """Return the cells as a Markdown table, with the touches and other causes of failure below."""
     names = ("baseline", "motion", "shape", "flights", "through", "refused", "touched", "other", "success (95 %)",
              "crossing m/s", "slowest", "clearance mm", "smallest", "contour IoU")  # fmt: skip
     lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
     for cell in cells:
-        rate = f"{cell['success_rate']:.0%} ({cell['success_low']:.0%} to {cell['success_high']:.0%})"
+        rate = ("refused: " if cell["wanted"] == "refused" else "") + shown_rate(cell)
         counts = " | ".join(str(cell[key]) for key in ("flights", "reached", "refused", "collided", "others"))
         speeds = f"{_shown(cell['crossing_speed_m_s'])} | {_shown(cell['crossing_speed_min_m_s'])}"
         room = f"{_shown(cell['clearance_m'], 1e3, 0)} | {_shown(cell['clearance_min_m'], 1e3, 0)}"
@@ -37,13 +42,18 @@ def gap_table(cells: Sequence[Row]) -> str:
             f"| {cell['baseline_mode']} | {cell['motion']} | {cell['shape']} | {counts} | {rate} | {speeds} | {room} "
             f"| {_shown(cell['contour_iou'])} |"
         )
+    for cell in cells:
+        if cell["shape"] == "all":
+            label = f"{cell['baseline_mode']}, motion {cell['motion']}"
+            lines += [f"\n{label}: touched in seed {', '.join(cell['touches'])}"] if cell["touches"] else []
+            lines += cause_lines(label, cell["causes"])
     return "\n".join(lines)
 
 
-def _cell(mode: str, motion: str, shape: str, rows: Sequence[Row]) -> Row:
+def _cell(mode: str, motion: str, shape: str, rows: Sequence[Row], wanted: str) -> Row:
     through = [row for row in rows if row["outcome"] == "reached"]
-    low, high = wilson(len(through), len(rows))
-    count = {name: sum(row["outcome"] == name for row in rows) for name in ("refused", "collided")}
+    touched = [row for row in rows if row["outcome"] == "collided"]
+    refused = sum(row["outcome"] == "refused" for row in rows)
     speeds = _values(through, "crossing_speed_m_s")
     rooms = _values(through, "clearance_m")
     return {
@@ -52,27 +62,25 @@ def _cell(mode: str, motion: str, shape: str, rows: Sequence[Row]) -> Row:
         "shape": shape,
         "flights": len(rows),
         "reached": len(through),
-        **count,
-        "others": len(rows) - len(through) - sum(count.values()),
-        "success_rate": round(len(through) / len(rows), 4),
-        "success_low": round(low, 4),
-        "success_high": round(high, 4),
+        "refused": refused,
+        "collided": len(touched),
+        "others": len(rows) - len(through) - refused - len(touched),
+        "wanted": wanted,
+        **success(rows, wanted),
         "crossing_speed_m_s": _median(speeds),
         "crossing_speed_min_m_s": min(speeds, default=None),
         "clearance_m": _median(rooms),
         "clearance_min_m": min(rooms, default=None),
         "contour_iou": _median(_values(rows, "contour_iou")),
-        "causes": _causes(rows),
+        "touches": [_touch(row) for row in touched],
+        "causes": causes([row for row in rows if row["outcome"] != "collided"], wanted),
     }
 
 
-def _causes(rows: Sequence[Row]) -> dict[str, int]:
-    causes: dict[str, int] = {}
-    for row in rows:
-        if row["outcome"] != "reached":
-            cause = row["outcome"] if row["outcome"] == "collided" else f"{row['outcome']}: {row['reason']}"
-            causes[cause] = causes.get(cause, 0) + 1
-    return causes
+def _touch(row: Row) -> str:
+    """Return the seed of a touch with how deep it was; the ground is named."""
+    clearance_m = row["min_clearance_m"]
+    return f"{row['seed']} by {-1e3 * clearance_m:.0f} mm" if clearance_m <= 0.0 else f"{row['seed']}: {row['reason']}"
 
 
 def _values(rows: Sequence[Row], key: str) -> list[float]:

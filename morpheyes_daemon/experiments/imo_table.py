@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.experiments.campaign import Row, wilson
+from morpheyes_daemon.experiments.flight_table import Row, cause_lines, causes, wilson
 from morpheyes_daemon.experiments.imo_measures import Sample, percentile, range_bins
 
 SPANS_M = ((0.0, 10.0), (10.0, 16.0))
@@ -25,7 +26,7 @@ def imo_cells(rows: Sequence[Row]) -> list[Row]:
 
 
 def imo_table(cells: Sequence[Row]) -> str:
-    """Return the cells as Markdown tables: one line per baseline, then detection and error by range."""
+    """Return the cells as Markdown tables: one line per baseline, detection and error by range, what ended flights."""
     names = ("baseline", "flights", "frames", "found (95 %)", "median error to 10 m", "p95", "beyond 10 m", "p95",
              "longest loss s", "false frames")  # fmt: skip
     lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
@@ -41,7 +42,8 @@ def imo_table(cells: Sequence[Row]) -> str:
             f"| {cell['baseline_mode']} | {cell['flights']} | {cell['frames']} | {rate} | {errors} "
             f"| {cell['longest_loss_s']:.1f} | {false} |"
         )
-    return "\n".join([*lines, "", *_by_range(cells)])
+    ended = [line for cell in cells for line in cause_lines(cell["baseline_mode"], cell["causes"])]
+    return "\n".join([*lines, "", *_by_range(cells), *ended])
 
 
 def draw_trajectories(rows: Sequence[Row], path: Path) -> None:
@@ -84,7 +86,7 @@ def _cell(mode: str, rows: Sequence[Row]) -> Row:
     return {
         "baseline_mode": mode,
         "flights": len(rows),
-        "outcomes": {name: sum(row["outcome"] == name for row in rows) for name in {row["outcome"] for row in rows}},
+        "outcomes": dict(Counter(row["outcome"] for row in rows)),
         "frames": len(samples),
         "detected": found,
         "detection_rate": round(found / len(samples), 4) if samples else None,
@@ -95,6 +97,7 @@ def _cell(mode: str, rows: Sequence[Row]) -> Row:
         "frames_watched": sum(row["frames_watched"] for row in rows),
         "false_frames": sum(row["false_frames"] for row in rows),
         "range_bins": range_bins(samples),
+        "causes": causes(rows),
     }
 
 

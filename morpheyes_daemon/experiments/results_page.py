@@ -12,7 +12,8 @@ from typing import Any
 
 from morpheyes_daemon.config import StereoConfig
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.experiments.campaign import SETTINGS, Row
+from morpheyes_daemon.experiments.campaign_results import SETTINGS, TABLE
+from morpheyes_daemon.experiments.flight_table import Row
 from morpheyes_daemon.experiments.plan import DISPARITIES_OF_PX, usual_calibration
 from morpheyes_daemon.experiments.stage import WIND_M_S
 
@@ -42,7 +43,8 @@ WHY = {
     ),
     "gap": (
         "Every opening is just large enough for the silhouette at a lean of 12° and 40 mm on every side; `small` ones "
-        "are to be refused. Success counts a crossing in which neither hull, bar nor propellers touch."
+        "are to be refused. Success counts a crossing in which neither hull, bar nor propellers touch; where no opening "
+        "is large enough it counts the refusals."
     ),
     "imo": (
         "A detection counts only where this frame's own measurement lies within max(0.3 m, 5 %) of the visible face; "
@@ -113,7 +115,7 @@ def _disparities(fraction: float) -> int:
 def _read(folder: Path) -> tuple[Row, str]:
     try:
         settings = json.loads((folder / SETTINGS).read_text(encoding="utf-8"))
-        return settings, (folder / "table.md").read_text(encoding="utf-8")
+        return settings, (folder / TABLE).read_text(encoding="utf-8")
     except FileNotFoundError as error:
         name = Path(str(error.filename)).name
         raise InputError(f"{folder}: has no {name}; is it the --out of a finished `morpheyes experiment`?") from None

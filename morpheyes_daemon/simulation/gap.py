@@ -33,7 +33,7 @@ class Opening(Section):
     """
 
     shape: Shape | Literal["any"] = "rectangle"
-    slack: float = Field(1.0, ge=0.3, le=5, description="1: what the vehicle needs just fits in")
+    slack: float = Field(1.0, ge=0.3, le=5, description="1: what the vehicle needs just fits in; less: to be refused")
     across_m: float | None = Field(None, ge=-3, le=3, description="to the right of the course line")
     height_m: float | None = Field(None, ge=0.8, le=2.4)
 
@@ -56,6 +56,11 @@ class GapWorld(Section):
     top_m: float = Field(3.4, ge=2, le=10)
     mural_m: float = Field(5.0, ge=2, le=50, description="from the wall to the mural behind it")
     meadow: bool = Field(True, description="grass and sky around; off where another world has them")
+
+    @property
+    def passable(self) -> bool:
+        """Whether there is an opening that what must fit in fits into; otherwise all are to be refused."""
+        return any(opening.slack >= 1.0 for opening in self.openings)
 
 
 def drawn_shape(shape: Shape | Literal["any"], seed: int) -> Shape:
