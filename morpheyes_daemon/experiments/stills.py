@@ -25,6 +25,9 @@ from morpheyes_daemon.transforms import R_FRD_CAM, Array, R_from_rpy, pose
 
 F_OF_WIDTH = 740.0 / 640.0
 MEAN_RADIANCE = 0.2
+LAMP_OF_MEDIAN = 6.0
+"""What is so much brighter than the median is a lamp."""
+
 NEAR_M, FAR_M = 1.0, 20.0
 """Range of depths compared: what a flight looks at."""
 
@@ -98,8 +101,9 @@ def make_stills(plan: StillPlan, out: Path, report: Report) -> list[StillResult]
 
 
 def _exposed(radiances: list[FloatMap]) -> list[Image]:
-    """Develop both eyes with the exposure of the left one."""
-    gain = np.float32(MEAN_RADIANCE / max(float(radiances[0].mean()), 1e-6))
+    """Develop both eyes with the exposure of the left one, for what is lit rather than for lamps."""
+    lit = np.minimum(radiances[0], LAMP_OF_MEDIAN * np.median(radiances[0]))
+    gain = np.float32(MEAN_RADIANCE / max(float(lit.mean()), 1e-6))
     return [encode(radiance * gain) for radiance in radiances]
 
 

@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages import FloatMap, Pinhole
-from morpheyes_daemon.simulation.scene import Material, Mesh, Scene
+from morpheyes_daemon.simulation.scene import Light, Material, Mesh, Scene
 from morpheyes_daemon.simulation.textures import Texture
 from morpheyes_daemon.transforms import Array
 
 VARIANT = "scalar_rgb"
-MAX_DEPTH = 4
+MAX_DEPTH = 8
+LAMP_M, LAMP_RADIANCE = 1.5, 10.0
+"""Edge and radiance of a lamp, a square that shines downwards."""
+
 TINT_STEP = 0.25
 """Tints are rounded to this, so that many trees share few bitmaps."""
 
@@ -33,8 +36,9 @@ def trace(scene: Scene, T_ned_cam: Array, pinhole: Pinhole, samples: int = 16, t
     import mitsuba
 
     mitsuba.set_variant(VARIANT)
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)  # it warns on standard output
     loaded = mitsuba.load_dict(scene_dict(scene, T_ned_cam, pinhole, samples, t_s))
-    rgb = np.asarray(mitsuba.render(loaded, seed=0), dtype=np.float32)
+    rgb = np.asarray(mitsuba.render(loaded, seed=mitsuba.UInt32(0)), dtype=np.float32)
     return np.ascontiguousarray(rgb[..., 2::-1])
 
 
@@ -42,17 +46,11 @@ def scene_dict(scene: Scene, T_ned_cam: Array, pinhole: Pinhole, samples: int, t
     """Return Mitsuba's own description of the scene."""
     import mitsuba
 
-    light = scene.light
     found: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": MAX_DEPTH, "hide_emitters": False},
         "sensor": _sensor(T_ned_cam, pinhole, samples),
-        "sun": {
-            "type": "directional",
-            "direction": (-light.direction).tolist(),
-            "irradiance": _rgb(np.array(light.sun) * math.pi),
-        },
-        "sky": {"type": "constant", "radiance": _rgb(np.array(light.sky))},
+        **_emitters(scene.light),
     }
     surfaces: dict[tuple[str, tuple[float, ...]], Any] = {}
     for number, (mesh, T_ned_mesh) in enumerate(_in_range(scene, T_ned_cam[:3, 3], t_s)):
@@ -64,6 +62,28 @@ def scene_dict(scene: Scene, T_ned_cam: Array, pinhole: Pinhole, samples: int, t
         shape.set_bsdf(mitsuba.load_dict(surfaces[mesh.material, tint]))
         found[f"mesh{number}"] = shape
     return found
+
+
+def _emitters(light: Light) -> dict[str, Any]:
+    """Return sun and sky, or the lamps of a closed room."""
+    if light.lamps_ned_m:
+        return {f"lamp{number}": _lamp(place) for number, place in enumerate(light.lamps_ned_m)}
+    return {
+        "sun": {
+            "type": "directional",
+            "direction": (-light.direction).tolist(),
+            "irradiance": _rgb(np.array(light.sun) * math.pi),
+        },
+        "sky": {"type": "constant", "radiance": _rgb(np.array(light.sky))},
+    }
+
+
+def _lamp(place_ned_m: tuple[float, float, float]) -> dict[str, Any]:
+    import mitsuba
+
+    T_ned_lamp = mitsuba.ScalarTransform4f().translate(list(place_ned_m)).scale(LAMP_M / 2)
+    shine = {"type": "area", "radiance": {"type": "rgb", "value": LAMP_RADIANCE}}
+    return {"type": "rectangle", "to_world": T_ned_lamp, "emitter": shine}
 
 
 def _in_range(scene: Scene, eye: Array, t_s: float) -> Iterator[tuple[Mesh, Array]]:
@@ -91,7 +111,7 @@ def _sensor(T_ned_cam: Array, pinhole: Pinhole, samples: int) -> dict[str, Any]:
         "principal_point_offset_x": (pinhole.cx_px + 0.5) / width - 0.5,
         "principal_point_offset_y": (pinhole.cy_px + 0.5) / height - 0.5,
         "near_clip": 0.05,
-        "to_world": mitsuba.ScalarTransform4f(T_ned_cam @ _CAM_FROM_MITSUBA),
+        "to_world": mitsuba.ScalarTransform4f((T_ned_cam @ _CAM_FROM_MITSUBA).tolist()),
         "film": {
             "type": "hdrfilm",
             "width": width,

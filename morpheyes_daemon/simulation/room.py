@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
@@ -60,6 +61,16 @@ LAMPS = Light(
     haze_range_m=1e4,
 )
 """Light indoors: lamps at the ceiling, bright walls, no haze."""
+
+LAMPS_APART_M, LAMPS_BELOW_M = 8.0, 0.02
+"""From one lamp to the next along the room, and how far below the ceiling they hang."""
+
+
+def room_light(world: RoomWorld) -> Light:
+    """Return the light of a room, with a row of lamps."""
+    count = max(1, round(world.length_m / LAMPS_APART_M))
+    along_m = [(k + 0.5) * world.length_m / count - world.behind_m for k in range(count)]
+    return replace(LAMPS, lamps_ned_m=tuple((x_m, 0.0, LAMPS_BELOW_M - world.height_m) for x_m in along_m))
 
 
 def room_contents(world: RoomWorld, light: Light, seed: int = 0) -> Contents:

@@ -59,13 +59,17 @@ class Material:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Sun (unit vector towards it, ned), radiances as linear BGR, and the range at which haze takes half."""
+    """Sun (unit vector towards it, ned), radiances as linear BGR, and the range at which haze takes half.
+
+    `lamps_ned_m` are the places of lamps in a closed room, for a renderer that follows light: no other gets in.
+    """
 
     towards_sun: tuple[float, float, float] = (-0.45, -0.55, -0.70)
     sun: Bgr = (1.9, 2.3, 2.6)
     sky: Bgr = (0.62, 0.55, 0.50)
     haze: Bgr = (0.46, 0.50, 0.43)
     haze_range_m: float = 90.0
+    lamps_ned_m: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def direction(self) -> Array:

@@ -24,7 +24,7 @@ from morpheyes_daemon.simulation.forest import ForestWorld, forest_contents
 from morpheyes_daemon.simulation.gap import GapWorld, gap_contents
 from morpheyes_daemon.simulation.ground import LEVEL, Ground, Relief
 from morpheyes_daemon.simulation.looks import materials_of, textures_of
-from morpheyes_daemon.simulation.room import LAMPS, Cube, RoomWorld, cube_contents, room_contents
+from morpheyes_daemon.simulation.room import Cube, RoomWorld, cube_contents, room_contents, room_light
 from morpheyes_daemon.simulation.scene import SKY_OBJECT, Bgr, Light, Mesh, Scene
 from morpheyes_daemon.transforms import Array
 from morpheyes_daemon.yaml_source import load_model
@@ -140,7 +140,8 @@ def build_world(file: WorldFile, seed: int) -> World:
         case GapWorld():
             return _world(gap_contents(world, seed, light), light, _behind_wall_m(world))
         case RoomWorld():
-            return _world(room_contents(world, LAMPS, seed), LAMPS, None, with_sky=False)
+            light = room_light(world)
+            return _world(room_contents(world, light, seed), light, None, with_sky=False)
         case MixedWorld():
             return _world(_mixed(world, seed, light), light, world.forest.course_m if world.forest.goal else None)
 

@@ -15,10 +15,14 @@ pytest.importorskip("numba")
 
 @pytest.mark.skipif(find_spec("mitsuba") is None, reason="Mitsuba is not installed (the figures extra)")
 @pytest.mark.slow
-def test_depth_agrees_in_the_gap_world(tmp_path: Path) -> None:
-    plan = StillPlan("gap", first_m=1.0, size=(320, 240), samples=16)
+@pytest.mark.parametrize(("world", "first_m", "valid"), [("gap", 1.0, 0.8), ("room", -1.5, 0.5)])
+def test_depth_agrees_out_of_doors_and_in_a_room_with_lamps(
+    world: str, first_m: float, valid: float, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    plan = StillPlan(world, first_m=first_m, size=(320, 240), samples=16)
     (result,) = make_stills(plan, tmp_path, lambda what, done, total: None)
-    assert min(result.fast_valid, result.traced_valid) > 0.8
+    assert capfd.readouterr().out == ""  # which belongs to --json
+    assert min(result.fast_valid, result.traced_valid) > valid
     assert result.difference_px < 0.3
     assert result.traced_error_px < 0.3
     assert (tmp_path / "000_compared.png").stat().st_size > 0
