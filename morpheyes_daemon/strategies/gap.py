@@ -22,7 +22,7 @@ from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, View
 from morpheyes_daemon.strategies.gap_crossing import Crossing
 from morpheyes_daemon.strategies.gap_parameters import GapParameters
-from morpheyes_daemon.strategies.gap_percept import GapPercept, gap_percept, tracked_place
+from morpheyes_daemon.strategies.gap_percept import GapPercept, PassedOver, at_range_of, gap_percept, tracked_place
 from morpheyes_daemon.strategies.gap_track import Motion, PointTrack
 from morpheyes_daemon.strategies.opening import Opening, Place, Silhouette
 from morpheyes_daemon.transforms import Array, wrap_rad
@@ -91,6 +91,7 @@ class Gap(Strategy):
         self._room: list[float] = []
         self._chosen: Opening | None = None
         self._beyond_m: deque[float] = deque(maxlen=2)
+        self._passed_over = PassedOver(parameters.confirm_frames)
         self._crossing = Crossing(parameters)
         self._yaw_rad = 0.0
         self._height_m = math.nan
@@ -133,7 +134,7 @@ class Gap(Strategy):
         self._settled_ns = self._seen_ns = observation.now_ns
 
     def _take_in(self, percept: GapPercept, observation: Observation) -> None:
-        """Follow the chosen opening, or choose one: the roomiest."""
+        """Follow the chosen opening, or choose one: the roomiest, and again when another one shows more room."""
         if self._phase in (Phase.BEHIND, Phase.OVER):
             return
         if self._phase is not Phase.RUN and percept.t_ns - self._seen_ns > FORGOTTEN_S * S:
@@ -150,10 +151,15 @@ class Gap(Strategy):
         if found is None:
             return
         opening, place = found
+        if self._phase is Phase.APPROACH and sure and self._passed_over.more_room(usable, place):
+            self._track, self._room = PointTrack(self._yaw_rad), []
+            return
         self._chosen = opening
         self._seen_ns = percept.t_ns
         self._beyond_m.append(opening.beyond_m)
-        p = self._scaled(np.array(place.p_ned_m), percept)
+        p = np.array(place.p_ned_m)
+        if not sure and self._track.count:  # the direction, at the range known before
+            p = at_range_of(self._track.at(percept.t_ns).p_m, p, percept, self._ahead())
         _, nods, _ = observation.at_exposure.rates_frd_rad_s
         sigma = np.hypot(RANGE_SIGMA, ATTITUDE_LATE_S * np.array([0.0, 0.0, nods]))
         sigma_m = np.hypot(sigma * max(0.5, opening.z_m), self._room_missed_m(place))
@@ -179,14 +185,6 @@ class Gap(Strategy):
     def _room_missed_m(self, place: Place) -> float:
         """How much less room is seen than was measured: so much of the opening may be missing on one side."""
         return max(0.0, float(np.median(self._room)) - place.clearance_m) if self._phase is Phase.RUN else 0.0
-
-    def _scaled(self, p_ned_m: Array, percept: GapPercept) -> Array:
-        """Return where the opening was seen; with the eyes under way only the direction, at the range known before."""
-        if percept.scale_sigma < SURE_SCALE or not self._track.count:
-            return p_ned_m
-        ahead, origin = self._ahead(), np.array(percept.origin_ned_m)
-        known = float((self._track.at(percept.t_ns).p_m - origin) @ ahead)
-        return np.asarray(origin + (p_ned_m - origin) * known / max(0.1, float((p_ned_m - origin) @ ahead)))
 
     def _approach(self, observation: Observation) -> MissionCommand:
         """Fly to the stand-off, set on the opening, confirm that the vehicle fits; then take the run or refuse."""

@@ -19,7 +19,8 @@ SAME_M = 0.5
 ALONG_SHARE = 0.4
 """Of what counts across, along the way: range is seen worse."""
 
-AS_GOOD_M = 0.005
+AS_GOOD_M, BETTER_M = 0.005, 0.02
+"""A place with so little less room is as good, an opening with so much more is better."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +80,27 @@ def tracked_place(
     near = [(off(place), opening, place) for opening in openings for place in _places(opening)]
     off_m, opening, place = min(near, key=lambda row: row[0])
     return (opening, place) if off_m < SAME_M else None
+
+
+def at_range_of(known_ned_m: Array, p_ned_m: Array, percept: GapPercept, ahead: Array) -> Array:
+    """Return a place (3,) in the direction in which it was seen, as far along `ahead` (3,) as a known one."""
+    origin = np.array(percept.origin_ned_m)
+    known_m, seen_m = float((known_ned_m - origin) @ ahead), float((p_ned_m - origin) @ ahead)
+    return np.asarray(origin + (p_ned_m - origin) * known_m / max(0.1, seen_m))
+
+
+class PassedOver:
+    """Whether the opening that is followed is the wrong one: from afar the roomiest may not be told."""
+
+    def __init__(self, frames: int) -> None:
+        self._frames, self._seen = frames, 0
+
+    def more_room(self, openings: Sequence[Opening], followed: Place) -> bool:
+        """Tell whether another opening has had clearly more room in `frames` frames in a row, up to this one."""
+        rooms_m = (opening.places[0].clearance_m for opening in openings if not opening.cut)
+        roomiest_m = max(rooms_m, default=-math.inf)
+        self._seen = self._seen + 1 if roomiest_m > followed.clearance_m + BETTER_M else 0
+        return self._seen >= self._frames
 
 
 def _places(opening: Opening) -> tuple[Place, ...]:

@@ -134,6 +134,30 @@ def test_of_several_openings_it_takes_the_one_with_most_room():
     assert course.vehicle.p_ned_m[1] == pytest.approx(-0.6, abs=0.05)
 
 
+def test_an_opening_that_seemed_roomier_from_afar_is_given_up_for_the_one_that_is():
+    def two(range_m):
+        seems_m = 0.3 if range_m > 6.5 else 0.01
+        place = (WALL_M, -0.6, -1.6)
+        return [*seen_from_afar(range_m, room_m=seems_m), *seen_from_afar(range_m, room_m=0.1, place=place)]
+
+    course = Course(two)
+    assert course.fly(30.0).reason is Reason.GOAL_REACHED
+    assert course.vehicle.p_ned_m[1] == pytest.approx(-0.6, abs=0.05)
+
+
+def test_of_two_openings_alike_it_keeps_to_one():
+    flips = iter([0.05, 0.0] * 500)
+
+    def two(range_m):
+        more_m = next(flips)
+        place = (WALL_M, -0.6, -1.6)
+        return [*seen_from_afar(range_m, room_m=0.1), *seen_from_afar(range_m, room_m=0.1 + more_m, place=place)]
+
+    course = Course(two)
+    assert course.fly(30.0).reason is Reason.GOAL_REACHED
+    assert len({round(command.line.p_ned_m[1], 1) for command in course.commands if command.line}) == 1
+
+
 def test_without_an_opening_it_refuses_after_a_look():
     course = Course(lambda range_m: [], look_s=12.0)
     last = course.fly(20.0)
