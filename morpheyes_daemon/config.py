@@ -198,14 +198,26 @@ class VehicleConfig(Section):
     recorder: RecorderConfig = RecorderConfig()
     dashboard: DashboardConfig = DashboardConfig()
 
+    @model_validator(mode="after")
+    def _can_be_held(self) -> VehicleConfig:
+        low_mm, high_mm = self._reach_mm
+        if self.hold_baseline_mm is not None and not low_mm <= self.hold_baseline_mm <= high_mm:
+            raise ValueError(f"hold_baseline_mm must be what the rig can take, from {low_mm:g} to {high_mm:g}")
+        return self
+
+    @property
+    def _reach_mm(self) -> tuple[float, float]:
+        if isinstance(self.servo, NoServoConfig):
+            return self.servo.baseline_mm, self.servo.baseline_mm
+        return self.servo.motion.min_baseline_mm, self.servo.motion.max_baseline_mm
+
     @property
     def baseline_range_m(self) -> tuple[float, float]:
         """Smallest and largest baseline the mission may ask for."""
         if self.hold_baseline_mm is not None:
             return self.hold_baseline_mm / 1e3, self.hold_baseline_mm / 1e3
-        if isinstance(self.servo, NoServoConfig):
-            return self.servo.baseline_mm / 1e3, self.servo.baseline_mm / 1e3
-        return self.servo.motion.min_baseline_mm / 1e3, self.servo.motion.max_baseline_mm / 1e3
+        low_mm, high_mm = self._reach_mm
+        return low_mm / 1e3, high_mm / 1e3
 
 
 class MissionFile(Section):

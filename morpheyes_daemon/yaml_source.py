@@ -65,10 +65,12 @@ def _sentence(problem: dict[str, Any], name: str, root: yaml.Node | None) -> str
         return f"{where}: {key}: there is no such key."
     if problem["type"] == "missing":
         return f"{where}: {'.'.join(location)}: is missing."
-    found = repr(problem.get("input"))
-    found = found if len(found) < 60 else found[:57] + "..."
     allowed = problem["msg"].removeprefix("Value error, ")
     allowed = allowed[0].lower() + allowed[1:]
+    if problem["type"] == "value_error" and isinstance(problem.get("input"), dict):
+        return f"{where}: {key}: {allowed}."  # about several keys, which the sentence names
+    found = repr(problem.get("input"))
+    found = found if len(found) < 60 else found[:57] + "..."
     return f"{where}: {key}: found {found}; {allowed}."
 
 

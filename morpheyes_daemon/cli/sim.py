@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -112,6 +113,7 @@ def _page(summary: Summary, folder: Path) -> str:
     speedup = s.simulated_s / s.wall_s if s.wall_s else 0.0
     rows = [
         ("outcome", f"{s.outcome} ({s.reason})"),
+        *([("why", textwrap.fill(s.text, 90, subsequent_indent=22 * " "))] if s.text else []),
         ("time, path", f"{s.time_s:.1f} s, {s.path_m:.1f} m"),
         ("speed", f"{s.mean_speed_m_s:.2f} m/s mean, {s.peak_speed_m_s:.2f} m/s peak"),
         ("smallest clearance", f"{1e3 * s.min_clearance_m:.0f} mm (hull and bar to obstacle)"),

@@ -56,7 +56,7 @@ class FlightPlan:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """The row of one flight; `summary.json` holds exactly these keys."""
+    """The row of one flight; `summary.json` holds exactly these keys. `text` tells more of the reason, if anyone did."""
 
     mission: str
     seed: int
@@ -64,6 +64,7 @@ class Summary:
     calibration: str
     outcome: str
     reason: str
+    text: str
     time_s: float
     path_m: float
     mean_speed_m_s: float
@@ -155,7 +156,7 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
         image_rate_hz=watchers.image_rate_hz,
     )
     daemon = Daemon(plan.config, plan.mission, parts, topics, events)
-    tally = Tally(topics)
+    tally = Tally(topics, events)
     for attach in watchers.attach:
         attach(daemon, stage)
     judge = Judge(stage, daemon.guardian, topics.gate, plan.limit_s)
@@ -233,14 +234,16 @@ def note_trouble(troubles: dict[str, str], event: Event) -> None:
 
 
 class Tally:
-    """Counts frames and hashes every stick that went out."""
+    """Counts frames, hashes every stick that went out, and keeps what was last said of each reason."""
 
-    def __init__(self, topics: Topics) -> None:
+    def __init__(self, topics: Topics, events: EventLog) -> None:
         self.frames = 0
+        self._said: dict[str, str] = {}
         self.first_ns = self.last_ns = 0
         self._hash = hashlib.sha256()
         topics.frame.tap(self._frame)
         topics.gate.tap(self._gate)
+        events.subscribe(self._event)
 
     @property
     def sticks_sha256(self) -> str:
@@ -251,6 +254,14 @@ class Tally:
     def rate_hz(self) -> float:
         """Mean frame rate."""
         return (self.frames - 1) * S / (self.last_ns - self.first_ns) if self.frames > 1 else 0.0
+
+    def said(self, reason: str) -> str:
+        """Return what a device, a task or the mission said of a reason, such as the size of a gap; else nothing."""
+        return self._said.get(reason, "")
+
+    def _event(self, event: Event) -> None:
+        if event.source != "guardian":  # whose text is the reason's own
+            self._said[event.reason] = event.text
 
     def _frame(self, frame: StereoFrame) -> None:
         self.frames += 1
@@ -274,6 +285,7 @@ def summarize_flight(
         calibration=RigModel.load(plan.calibration).origin,
         outcome=verdict.outcome,
         reason=verdict.reason,
+        text=tally.said(verdict.reason),
         time_s=verdict.time_s,
         path_m=verdict.path_m,
         mean_speed_m_s=verdict.path_m / verdict.time_s if verdict.time_s else 0.0,

@@ -14,7 +14,7 @@ from morpheyes_daemon.app import Daemon
 from morpheyes_daemon.experiments.flight import FlightPlan
 from morpheyes_daemon.experiments.gap_truth import filled, iou, true_masks
 from morpheyes_daemon.experiments.stage import Stage
-from morpheyes_daemon.messages import Intent, MissionCommand, Perception, StereoFrame
+from morpheyes_daemon.messages import Perception, StereoFrame
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.gap import GapWorld, drawn_shape
@@ -46,14 +46,12 @@ class GapMeasures:
         self._crossing_m_s = math.nan
         self._before_m = math.nan
         self._sequence: list[list[float]] = []
-        self._text = ""
 
     def attach(self, daemon: Daemon, stage: Stage) -> None:
         """Look on at this flight."""
         daemon.topics.frame.tap(self._keep)
         daemon.topics.perception.tap(lambda seen: self._compare(seen, daemon, stage))
         daemon.topics.gate.tap(lambda out: self._watch(out, stage))
-        daemon.topics.command.tap(self._hear)
 
     def row(self) -> dict[str, Any]:
         """Return the columns of a gap flight."""
@@ -64,7 +62,6 @@ class GapMeasures:
             "contour_iou": _rounded(float(np.median(self._ious)) if self._ious else math.nan),
             "shape": shape,
             "motion": motion,
-            "text": self._text,
             "sequence": self._sequence,
         }
 
@@ -109,10 +106,6 @@ class GapMeasures:
         if -BEFORE_M < x < BEHIND_M and (not self._sequence or x > self._sequence[-1][0] + APART_M):
             pose = (x, y, z, *rpy_from_R(T_wall_frd[:3, :3]), baseline_m)
             self._sequence.append([round(value, 4) for value in pose])
-
-    def _hear(self, command: MissionCommand) -> None:
-        if command.intent is Intent.REFUSE:
-            self._text = self._text or command.text
 
 
 def _past_wall_m(T_ned_wall: Array, T_ned_frd: Array) -> float:

@@ -70,6 +70,7 @@ class Judge:
         self._stage = stage
         self._guardian = guardian
         self._limit_s = limit_s
+        self._engaged = False
         self._engaged_ns = 0
         self._last: tuple[float, float, float] | None = None
         self._path_m = 0.0
@@ -88,7 +89,7 @@ class Judge:
             await ticker.wait()
             await self._stage.vehicle.catch_up()
             now_ns = self._stage.clock.now_ns()
-            if self._guardian.state is State.ENGAGED and not self._engaged_ns:
+            if self._engaged and not self._engaged_ns:
                 self._engaged_ns = now_ns
             self._measure(now_ns)
             decided = self._decide(now_ns)
@@ -145,6 +146,8 @@ class Judge:
         )
 
     def _count(self, out: GateOutput) -> None:
+        # a mission that refuses at once is engaged for one stick period, which the ticker may miss
+        self._engaged |= out.state is State.ENGAGED
         if out.state is State.BRAKING and self._state is not State.BRAKING and out.reason not in NOT_RESUMED:
             self._braking += 1
         self._state = out.state

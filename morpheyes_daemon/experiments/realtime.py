@@ -216,7 +216,7 @@ async def realtime_daemon(
             worker = parts.worker
             assert isinstance(worker, ProcessWorker)
             daemon = Daemon(config, plan.mission, parts, topics, events)
-            watchers = Tally(topics), StickBeat(topics.gate)
+            watchers = Tally(topics, events), StickBeat(topics.gate)
             topics.gate.tap(simulator.tell)
             with closing(_recorder(plan, config, daemon, log, ready.scene_json)):
                 stop = asyncio.Event()

@@ -18,6 +18,12 @@ from morpheyes_daemon.simulation.scene import Bgr, Material, Mesh, MovingObject
 from morpheyes_daemon.simulation.textures import Texture
 from morpheyes_daemon.transforms import Array
 
+FLYING_HEIGHT_M = 1.5
+"""Height of start and goal over the ground."""
+
+START_ROOM_M = 0.3
+"""Half the width of a vehicle with its eyes apart: this near to the start and the goal nothing may stand."""
+
 
 @dataclass(frozen=True, slots=True)
 class Disc:

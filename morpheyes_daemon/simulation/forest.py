@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.simulation import meshes, textures
-from morpheyes_daemon.simulation.contents import Contents
+from morpheyes_daemon.simulation.contents import START_ROOM_M, Contents
 from morpheyes_daemon.simulation.ground import Ground, Relief, lay
 from morpheyes_daemon.simulation.scene import GROUND_OBJECT, Light, Material, Mesh
 from morpheyes_daemon.simulation.species import BROADLEAVES, CONIFERS, broadleaf, conifer
@@ -34,6 +34,9 @@ GROUND_STEP_M = 2.0
 
 ROW_STEP_M, ROW_RADIUS_M = 0.5, 0.2
 """Trunks of a row; 10 cm are free between two."""
+
+JAMMED = 0.547
+"""Share of a plane that circles placed at random cover when no more fit in between (random sequential addition)."""
 
 _AROUND = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
@@ -70,15 +73,53 @@ class ForestWorld(Section):
             raise ValueError("radius_min_m must not be greater than radius_max_m")
         return self
 
+    @model_validator(mode="after")
+    def _room_for_all_trees(self) -> ForestWorld:
+        circle_m = self.radius_min_m + 0.5 * _apart_m(self)
+        room_m2 = (_length(self) + 2 * circle_m) * 2 * (self.half_width_m + circle_m)
+        if _wanted(self) * math.pi * circle_m**2 > JAMMED * room_m2:
+            raise ValueError(
+                f"{self.trees_per_ha:g} trees per hectare cannot stand {self.gap_m:g} m apart; ask for fewer trees or a "
+                "smaller gap_m"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _rows_beside_the_ends(self) -> ForestWorld:
+        x0, x1, y0, y1 = area_of(self)
+        places = {"start": (0.0, 0.0), **({"goal": (self.course_m, 0.0)} if self.goal else {})}
+        for row in self.rows:
+            a, b = np.array(row[:2]), np.array(row[2:])
+            if not all(x0 <= x <= x1 and y0 <= y <= y1 for x, y in (a, b)):
+                extent = f"from {x0:g} to {x1:g} m along x and {y1:g} m to both sides"
+                raise ValueError(f"the row {list(row)} leaves the forest, which reaches {extent}")
+            for name, place in places.items():
+                if _beside_m(np.array(place), a, b) < ROW_RADIUS_M + START_ROOM_M:
+                    raise ValueError(f"the row {list(row)} stands on the {name}")
+        return self
+
+
+def _beside_m(p: Array, a: Array, b: Array) -> float:
+    """Return the distance of a point from the line between two, all (2,)."""
+    along = (p - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-9)
+    return float(np.linalg.norm(p - a - np.clip(along, 0.0, 1.0) * (b - a)))
+
+
+def _wanted(world: ForestWorld) -> int:
+    return round(world.trees_per_ha * _length(world) * 2 * world.half_width_m / 1e4)
+
+
+def _apart_m(world: ForestWorld) -> float:
+    """Between two trunks at the ground, so that leaning ones keep the gap up to 3 m above it."""
+    return world.gap_m + 2 * 3.0 * math.tan(math.radians(world.max_lean_deg))
+
 
 def plant(world: ForestWorld, seed: int, glades: Glades = ()) -> list[Tree]:
     """Place the trees one after the other where they keep `gap_m` to those that stand already."""
     rng = np.random.default_rng([seed, 100])
     x_low, x_high = -world.run_in_m, world.course_m + world.run_out_m
-    wanted = round(world.trees_per_ha * (x_high - x_low) * 2 * world.half_width_m / 1e4)
+    wanted, gap = _wanted(world), _apart_m(world)
     lean_rad = math.radians(world.max_lean_deg)
-    # leaning trunks keep the gap up to 3 m above the ground
-    gap = world.gap_m + 2 * 3.0 * math.tan(lean_rad)
     kept = (*_ends(world), *glades)
     places = np.empty((wanted, 3))
     ground = lay(world.relief, seed)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import math
+from itertools import combinations
+from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.simulation import meshes
@@ -21,6 +23,11 @@ WALL_OBJECT, MURAL_OBJECT = 1, 2
 BELOW_GROUND_M = 1.2
 """How far the wall goes on below the ground, so that it may sway downwards and upwards."""
 
+DRAWN_HEIGHT_M = (1.2, 1.8)
+"""Between these the seed puts the middle of an opening whose height is not given."""
+
+APART_M = 0.4
+"""Of wall between two openings without a place of their own."""
 
 BLOBS = 20
 """Different blobs among the shapes that `any` draws from."""
@@ -61,6 +68,64 @@ class GapWorld(Section):
     def passable(self) -> bool:
         """Whether there is an opening that what must fit in fits into; otherwise all are to be refused."""
         return any(opening.slack >= 1.0 for opening in self.openings)
+
+    @model_validator(mode="after")
+    def _openings_in_the_wall(self) -> GapWorld:
+        """Refuse what no seed can build: whatever its shape, an opening is at least the rectangle that fits in."""
+        boxes = [self._least(opening) for opening in self.openings]
+        wide_m, top_m = 2 * self.half_width_m, self.top_m
+        for number, box in enumerate(boxes, 1):
+            above, below = box.low_m + 0.5 * box.height_m, box.high_m - 0.5 * box.height_m
+            if box.width_m >= wide_m or above >= top_m or below <= -BELOW_GROUND_M:
+                raise ValueError(
+                    f"opening {number}, at least {box.width_m:.2f} x {box.height_m:.2f} m, reaches beyond the wall, "
+                    f"{wide_m:g} m wide and from {BELOW_GROUND_M:g} m below the ground to {top_m:g} m above it"
+                )
+        if (span := _span_m(boxes)) >= wide_m:
+            raise ValueError(f"the openings take at least {span:.2f} m side by side, and the wall is {wide_m:g} m wide")
+        for (i, one), (j, other) in combinations(enumerate(boxes, 1), 2):
+            if one.overlaps(other):
+                raise ValueError(f"openings {i} and {j} overlap; set them further apart")
+        return self
+
+    @model_validator(mode="after")
+    def _mural_out_of_reach(self) -> GapWorld:
+        turn_rad = math.radians(self.motion.turn_deg if self.motion.kind != "none" else 0.0)
+        swings_m = self.half_width_m * math.sin(turn_rad)
+        if swings_m >= self.mural_m:
+            raise ValueError(f"the wall turns {swings_m:.1f} m back, and the mural is {self.mural_m:g} m behind it")
+        return self
+
+    def _least(self, opening: Opening) -> _Box:
+        low_m, high_m = DRAWN_HEIGHT_M if opening.height_m is None else (opening.height_m, opening.height_m)
+        width_m, height_m = opening.slack * self.fit_width_mm / 1e3, opening.slack * self.fit_height_mm / 1e3
+        return _Box(width_m, height_m, opening.across_m, low_m, high_m)
+
+
+class _Box(NamedTuple):
+    """The least that an opening can be in the world of any seed, and where its middle may lie, None: anywhere."""
+
+    width_m: float
+    height_m: float
+    across_m: float | None
+    low_m: float
+    high_m: float
+
+    def overlaps(self, other: _Box) -> bool:
+        """Tell whether two openings touch wherever the seed puts them."""
+        if self.across_m is None or other.across_m is None:
+            return False
+        beside_m = abs(self.across_m - other.across_m)
+        above_m = max(self.high_m - other.low_m, other.high_m - self.low_m)
+        return beside_m <= 0.5 * (self.width_m + other.width_m) and above_m <= 0.5 * (self.height_m + other.height_m)
+
+
+def _span_m(boxes: list[_Box]) -> float:
+    """Return how far openings reach from left to right at least, as far as that is known before the seed."""
+    known = [(box.across_m, 0.5 * box.width_m) for box in boxes if box.across_m is not None]
+    if known:
+        return max(across + half for across, half in known) - min(across - half for across, half in known)
+    return sum(box.width_m for box in boxes) + APART_M * (len(boxes) - 1)
 
 
 def drawn_shape(shape: Shape | Literal["any"], seed: int) -> Shape:
@@ -112,12 +177,12 @@ def _place(world: GapWorld, rng: np.random.Generator, seed: int) -> tuple[tuple[
         for o in world.openings
     ]
     widths = np.array([np.ptp(shape[:, 0]) for shape in shapes])
-    lanes = np.cumsum(widths + 0.4) - 0.5 * (widths + 0.4)
+    lanes = np.cumsum(widths + APART_M) - 0.5 * (widths + APART_M)
     lanes -= lanes.mean() - rng.uniform(-0.6, 0.6)
     placed = []
     for opening, shape, lane in zip(world.openings, shapes, lanes, strict=True):
         across = float(lane) if opening.across_m is None else opening.across_m
-        height = float(rng.uniform(1.2, 1.8)) if opening.height_m is None else opening.height_m
+        height = float(rng.uniform(*DRAWN_HEIGHT_M)) if opening.height_m is None else opening.height_m
         placed.append(shape + np.array([across, -height]))
     middle = float(np.mean([corners[:, 0].mean() for corners in placed]))
     return tuple(corners - np.array([middle, 0.0]) for corners in placed), middle

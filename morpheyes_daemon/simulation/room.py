@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.simulation import meshes
 from morpheyes_daemon.simulation.collision import MovingObstacles, Obstacles, box_solid
-from morpheyes_daemon.simulation.contents import Contents, lit
+from morpheyes_daemon.simulation.contents import FLYING_HEIGHT_M, START_ROOM_M, Contents, lit
 from morpheyes_daemon.simulation.motion import along_waypoints
 from morpheyes_daemon.simulation.scene import GROUND_OBJECT, Light, MovingObject
 from morpheyes_daemon.transforms import Array, pose
@@ -21,6 +21,8 @@ from morpheyes_daemon.transforms import Array, pose
 CUBE_OBJECT, ROOM_OBJECT = 1, 2
 PLATE_M = 0.2
 """Thickness of walls, floor and ceiling."""
+LOWEST_EDGES = 2.0
+"""The cube's middle stays this many edges above the floor."""
 
 
 class Cube(Section):
@@ -40,6 +42,13 @@ class Cube(Section):
             raise ValueError("the times of the waypoints must grow from one to the next")
         return self
 
+    @model_validator(mode="after")
+    def _above_ground(self) -> Cube:
+        for t_s, _, _, height_m in self.waypoints:
+            if height_m < 0.5 * self.edge_mm / 1e3:
+                raise ValueError(f"the waypoint at {t_s:g} s has the cube in the ground; give the height of its middle")
+        return self
+
 
 class RoomWorld(Section):
     """What a room file may say; the start is (0, 0), the room reaches from `behind_m` behind it along x."""
@@ -51,6 +60,53 @@ class RoomWorld(Section):
     height_m: float = Field(4.0, ge=2, le=20)
     pillars: tuple[tuple[float, float, float], ...] = Field((), description="x_m, y_m and edge_m of square columns")
     cube: Cube | None = None
+
+    @property
+    def x_range_m(self) -> tuple[float, float]:
+        """Where the room begins and ends along the course."""
+        return -self.behind_m, self.length_m - self.behind_m
+
+    @model_validator(mode="after")
+    def _start_is_free(self) -> RoomWorld:
+        (x0, x1), half = self.x_range_m, 0.5 * self.width_m
+        if x1 <= START_ROOM_M:
+            raise ValueError("the start lies outside the room: behind_m must be less than length_m")
+        for x, y, edge in self.pillars:
+            if edge <= 0.0:
+                raise ValueError(f"the pillar at {x:g}, {y:g} m needs an edge of more than 0 m")
+            if not (x0 < x < x1 and abs(y) < half):
+                raise ValueError(f"the pillar at {x:g}, {y:g} m stands outside the room, {self._extent}")
+            if max(abs(x), abs(y)) < 0.5 * edge + START_ROOM_M:
+                raise ValueError(f"the pillar at {x:g}, {y:g} m stands on the start, which is at 0, 0")
+        return self
+
+    @model_validator(mode="after")
+    def _cube_has_room(self) -> RoomWorld:
+        """The cube's waypoints, as far as the seed may move them, leave half an edge to everything."""
+        if self.cube is None:
+            return self
+        (x0, x1), half, top = self.x_range_m, 0.5 * self.width_m, self.height_m
+        edge = self.cube.edge_mm / 1e3
+        reach = 0.5 * edge
+        if LOWEST_EDGES * edge + reach > top:
+            raise ValueError(f"a cube of {edge:g} m, which stays {LOWEST_EDGES * edge:g} m up, is too high for the room")
+        for t_s, x, y, height in self.cube.waypoints:
+            aside = self.cube.scatter * abs(x)
+            inside = x0 + reach <= x <= x1 - reach and abs(y) + aside + reach <= half
+            if not (inside and height + 0.5 * aside + reach <= top):
+                raise ValueError(f"the waypoint at {t_s:g} s takes the cube out of the room, {self._extent}")
+            if any(max(abs(x - px), abs(y - py)) < reach + 0.5 * thick for px, py, thick in self.pillars):
+                raise ValueError(f"the waypoint at {t_s:g} s has the cube in a pillar")
+        _, x, y, height = self.cube.waypoints[0]
+        if max(abs(x), abs(y)) < reach + START_ROOM_M and height - reach < FLYING_HEIGHT_M + START_ROOM_M:
+            raise ValueError("the cube waits for its first waypoint's time where the vehicle starts, at 0, 0")
+        return self
+
+    @property
+    def _extent(self) -> str:
+        x0, x1 = self.x_range_m
+        sides = f"{0.5 * self.width_m:g} m to both sides"
+        return f"which reaches from {x0:g} to {x1:g} m along x, {sides} and {self.height_m:g} m up"
 
 
 LAMPS = Light(
@@ -75,7 +131,7 @@ def room_light(world: RoomWorld) -> Light:
 
 def room_contents(world: RoomWorld, light: Light, seed: int = 0) -> Contents:
     """Return the room and its cube, whose way depends on the seed if it is scattered."""
-    x0, x1 = -world.behind_m, world.length_m - world.behind_m
+    x0, x1 = world.x_range_m
     middle, half, top = 0.5 * (x0 + x1), 0.5 * world.width_m, world.height_m
     length, width = world.length_m + 2 * PLATE_M, world.width_m + 2 * PLATE_M
     plates = (
@@ -112,5 +168,5 @@ def _scattered(cube: Cube, seed: int) -> Array:
     waypoints = np.array(cube.waypoints)
     shift = np.random.default_rng([seed, 500]).uniform(-1.0, 1.0, (len(waypoints), 2))
     waypoints[:, 2:] += cube.scatter * waypoints[:, 1:2] * shift * (1.0, 0.5)
-    waypoints[:, 3] = np.maximum(waypoints[:, 3], 2.0 * cube.edge_mm / 1e3)
+    waypoints[:, 3] = np.maximum(waypoints[:, 3], LOWEST_EDGES * cube.edge_mm / 1e3)
     return waypoints

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.simulation.ground import Ground
@@ -33,6 +33,12 @@ class Undergrowth(Section):
     branches_per_tree: float = Field(0.0, ge=0, le=20, description="mean number")
     branch_length_m: float = Field(0.6, ge=0.1, le=2, description="the longest, from the bark")
     branch_radius_mm: float = Field(18.0, ge=4, le=60, description="at the trunk, the thickest")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Undergrowth:
+        if self.bush_height_min_m > self.bush_height_max_m:
+            raise ValueError("bush_height_min_m must not be greater than bush_height_max_m")
+        return self
 
 
 def bushes(undergrowth: Undergrowth, area: Area, ground: Ground, seed: int, glades: Glades) -> list[Tree]:

@@ -19,7 +19,7 @@ from morpheyes_daemon.config import Section
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.simulation import meshes, textures
 from morpheyes_daemon.simulation.collision import CollisionWorld, VehicleShape
-from morpheyes_daemon.simulation.contents import Contents, Disc, GapTruth
+from morpheyes_daemon.simulation.contents import FLYING_HEIGHT_M, START_ROOM_M, Contents, Disc, GapTruth
 from morpheyes_daemon.simulation.forest import ForestWorld, forest_contents
 from morpheyes_daemon.simulation.gap import GapWorld, gap_contents
 from morpheyes_daemon.simulation.ground import LEVEL, Ground, Relief
@@ -30,9 +30,6 @@ from morpheyes_daemon.transforms import Array
 from morpheyes_daemon.yaml_source import load_model
 
 FOLDER = Path(__file__).parent / "worlds"
-
-FLYING_HEIGHT_M = 1.5
-"""Height of start and goal over the ground."""
 
 
 class MixedWorld(Section):
@@ -47,6 +44,16 @@ class MixedWorld(Section):
     def _level(self) -> MixedWorld:
         if self.forest.relief != Relief():
             raise ValueError("the ground of a mixed course must be level, since the wall stands on it")
+        return self
+
+    @model_validator(mode="after")
+    def _wall_on_the_course(self) -> MixedWorld:
+        course_m, wall_m = self.forest.course_m, self.gap.distance_m
+        mural_m = wall_m + self.gap.mural_m
+        if wall_m > course_m - START_ROOM_M:
+            raise ValueError(f"the wall at {wall_m:g} m must stand on the course, which ends at {course_m:g} m")
+        if self.forest.goal and abs(mural_m - course_m) < START_ROOM_M:
+            raise ValueError(f"the mural at {mural_m:g} m stands on the goal at {course_m:g} m; change mural_m")
         return self
 
 
@@ -143,7 +150,9 @@ def build_world(file: WorldFile, seed: int) -> World:
             light = room_light(world)
             return _world(room_contents(world, light, seed), light, None, with_sky=False)
         case MixedWorld():
-            return _world(_mixed(world, seed, light), light, world.forest.course_m if world.forest.goal else None)
+            goal_m = world.forest.course_m if world.forest.goal else None
+            planted = _world(_mixed(world, seed, light), light, goal_m)
+            return replace(planted, heading_rad=math.radians(world.forest.heading_deg))
 
 
 def _behind_wall_m(world: GapWorld) -> float:
@@ -154,7 +163,7 @@ def _mixed(world: MixedWorld, seed: int, light: Light) -> Contents:
     gap = world.gap.model_copy(update={"meadow": False})
     glade = (gap.distance_m + 0.5 * gap.mural_m, 0.0, gap.half_width_m + gap.mural_m + 2.0)
     found = forest_contents(world.forest, seed, light, (glade,)) + gap_contents(gap, seed, light)
-    return found if world.cube is None else found + cube_contents(world.cube, light)
+    return found if world.cube is None else found + cube_contents(world.cube, light, seed)
 
 
 def _world(contents: Contents, light: Light, goal_m: float | None, with_sky: bool = True) -> World:

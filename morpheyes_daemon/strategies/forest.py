@@ -12,7 +12,7 @@ from enum import StrEnum
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config import Section
@@ -57,6 +57,14 @@ class ForestParameters(StrategyParameters):
     turn_gains: tuple[float, float, float] = Field((1.2, 0.0, 0.05), description="kp, ki, kd on the heading error")
     look_rate_deg_s: float = Field(35.0, gt=1, le=90, description="yaw rate when looking around")
 
+    @model_validator(mode="after")
+    def _ordered(self) -> ForestParameters:
+        if self.tight_margin_m > self.margin_m:
+            raise ValueError("tight_margin_m must not be greater than margin_m")
+        if self.reach_m < self.safe_m + OPEN_BEYOND_M:
+            raise ValueError(f"reach_m must be at least {OPEN_BEYOND_M:g} m more than safe_m, or no direction is free")
+        return self
+
 
 ASTRAY_RAD = math.radians(75.0)
 """A goal further off the nose than this lies behind."""
@@ -68,6 +76,9 @@ DETOUR_FROM_M = 8.0
 OPEN_SHARE = 0.6
 """A heading is open when it is free for this share of what is compared. It does not shrink with the speed: a slow
 vehicle would find a heading into a tree good enough, and stay slow."""
+
+OPEN_BEYOND_M = 0.6
+"""A direction is worth flying in when it is free for so much more than `safe_m`."""
 
 UNSEEN_M = 2.0
 """Where something is taken to stand in a direction of which nothing at all is known."""
@@ -188,7 +199,7 @@ class Forest(Strategy):
         for margin_m in (parameters.margin_m, parameters.tight_margin_m):
             half_width = self._half_width_m(margin_m, observation.baseline_m)
             free = free_distance_m(obstacles, headings, half_width, reach)
-            if free.max() >= parameters.safe_m + 0.6:
+            if free.max() >= parameters.safe_m + OPEN_BEYOND_M:
                 break
         else:
             return None

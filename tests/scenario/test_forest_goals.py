@@ -1,4 +1,4 @@
-"""Goals that are not simply ahead, ground that is not level: whole flights in lockstep, judged by the truth."""
+"""Goals that are not simply ahead, ground that is not level, and what else grows: whole flights, judged by the truth."""
 
 from __future__ import annotations
 
@@ -62,3 +62,28 @@ def test_height_is_kept_over_rolling_ground(tmp_path: Path) -> None:
     # 10 degrees at 3 m/s are 0.5 m/s of climb, which surface tracking is behind by a second
     assert min(heights) > 0.9
     assert max(heights) < 2.1
+
+
+@pytest.mark.parametrize("world", ["forest_light", "forest_bushes", "forest_branches"])
+def test_the_goal_is_reached_against_the_sun_and_through_undergrowth(world: str) -> None:
+    summary = fly(plan_of("forest", world=world))
+    assert summary.outcome == "reached"
+    assert summary.min_clearance_m > 0.0
+
+
+def test_a_mixed_course_is_flown_around_its_wall() -> None:
+    crossings_m: list[float] = []
+
+    def attach(daemon: Daemon, stage: Stage) -> None:
+        def note(out: GateOutput) -> None:
+            north_m, east_m, _ = stage.truth(out.t_ns).p_ned_m
+            if abs(north_m - 45.0) < 0.1:
+                crossings_m.append(abs(east_m))
+
+        daemon.topics.gate.tap(note)
+
+    summary = fly(plan_of("mixed"), Watchers(attach=[attach]))
+    assert summary.outcome == "reached"
+    assert summary.min_clearance_m > 0.0
+    # the wall is 8 m wide, its opening in the middle
+    assert min(crossings_m) > 4.0

@@ -46,6 +46,37 @@ def test_the_documented_strategy_flies(tmp_path: Path, monkeypatch: pytest.Monke
     assert commands[-1].z_close_m < 16.0
 
 
+REFUSE = """
+        return replace(command, intent=Intent.REFUSE, reason=Reason.MISSION_REFUSED, text="the trees are too tall")"""
+STUMBLE = """
+        return command.no_such_thing"""
+
+
+@pytest.mark.parametrize(
+    ("after_engaging", "outcome", "text"),
+    [(REFUSE, "refused", "the trees are too tall"), (STUMBLE, "aborted", "mission: .*no_such_thing.*")],
+)
+def test_the_summary_tells_why_a_flight_was_refused_or_aborted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after_engaging: str, outcome: str, text: str
+) -> None:
+    source = block("python") + (
+        "\n\nfrom dataclasses import replace\n"
+        "class Moody(Ahead):\n"
+        "    def decide(self, observation):\n"
+        "        command = super().decide(observation)\n"
+        "        if not observation.engaged:\n"
+        f"            return command{after_engaging}\n"
+    )
+    module = types.ModuleType("moody")
+    exec(compile(source, "moody.py", "exec"), module.__dict__)
+    monkeypatch.setitem(__import__("sys").modules, "moody", module)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [EntryPoint("moody", "moody:Moody", group)])
+    (tmp_path / "moody.yaml").write_text("strategy: moody\n", encoding="utf-8")
+    summary = fly(make_plan(str(tmp_path / "moody.yaml"), world="glade", size="160x120", calibration="exact"))
+    assert summary.outcome == outcome
+    assert re.fullmatch(text, summary.text)
+
+
 @pytest.mark.parametrize(("method", "what"), [("perceive", "'View' object"), ("decide", "'Observation' object")])
 def test_a_mistake_in_a_strategy_is_named_with_its_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, what: str

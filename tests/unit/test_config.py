@@ -81,6 +81,42 @@ def test_a_strategys_parameters_are_checked_in_their_file(tmp_path: Path) -> Non
         load_mission(str(path))
 
 
+@pytest.mark.parametrize(
+    ("strategy", "parameters", "words"),
+    [
+        ("imo", "height_m: [3, 1]", "height_m must be the lowest and then the highest flying height"),
+        ("imo", "height_m: [-1, 2]", "from 0.3 to 20 m"),
+        ("imo", "behaviour: {kind: pursue, distance_m: 1, tolerance_m: 2}", "tolerance_m must be less than distance_m"),
+        ("forest", "margin_m: 0.1", "tight_margin_m must not be greater than margin_m"),
+        ("forest", "{reach_m: 4, safe_m: 5}", "reach_m must be at least 0.6 m more than safe_m"),
+    ],
+)
+def test_ranges_the_wrong_way_round_are_refused_in_one_sentence(
+    tmp_path: Path, strategy: str, parameters: str, words: str
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"strategy: {strategy}\nparameters:\n  {parameters}\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=words) as caught:
+        load_mission(str(path))
+    assert re.match(r"\S*mine.yaml:[23]: parameters", str(caught.value))
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_height_may_be_prescribed_by_equal_bounds(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("strategy: imo\nparameters: {height_m: [1.5, 1.5]}\n", encoding="utf-8")
+    assert load_mission(str(path)).strategy == "imo"
+
+
+@pytest.mark.parametrize(
+    ("servo", "held_mm", "limits"), [("serial", 400, "100 to 300"), ("serial", 50, "100 to 300"), ("none", 150, "200 to 200")]
+)
+def test_only_a_baseline_that_the_rig_can_take_is_held(servo: str, held_mm: float, limits: str) -> None:
+    text = f"camera: {{backend: v4l2}}\nservo: {{backend: {servo}}}\nhold_baseline_mm: {held_mm}\n"
+    assert errors(text) == [f"config.yaml:1: the file: hold_baseline_mm must be what the rig can take, from {limits}."]
+    parse_model(text.replace(f": {held_mm}", ": 200"), VehicleConfig, "config.yaml")
+
+
 def test_every_setting_is_read_somewhere() -> None:
     text = "".join(path.read_text() for path in PACKAGE.rglob("*.py") if path.name != "config.py")
     unread = {name for name in settings(VehicleConfig) if not re.search(rf"\b{name}\b", text)}

@@ -13,7 +13,8 @@ from morpheyes_daemon.simulation.collision import VehicleShape
 from morpheyes_daemon.simulation.forest import ForestWorld, plant
 from morpheyes_daemon.simulation.scene import Light
 from morpheyes_daemon.simulation.trees import Tree
-from morpheyes_daemon.simulation.worlds import Daylight, build_world, load_world, world_names
+from morpheyes_daemon.simulation.worlds import Daylight, WorldFile, build_world, load_world, world_names
+from morpheyes_daemon.yaml_source import parse_model
 
 CONTROL_RADIUS_M = 0.17
 """Footprint of the straight-line control run."""
@@ -160,3 +161,79 @@ def test_a_mixed_course_on_a_slope_is_refused(tmp_path: Path) -> None:
     path.write_text(f"world: {{kind: mixed, forest: {forest}, gap: {{kind: gap}}}}", encoding="utf-8")
     with pytest.raises(ConfigError, match="level"):
         load_world(str(path))
+
+
+ROOM, WALL = "kind: room, length_m: 20, width_m: 8, height_m: 4", "kind: gap, half_width_m: 2, top_m: 3"
+STAYS, LOW = "[9, 5, 0, 1.5]", "across_m: 0, height_m: 1.2"
+FOREST = "kind: forest, course_m: 30"
+
+
+@pytest.mark.parametrize(
+    ("world", "words"),
+    [
+        (f"{WALL}, fit_width_mm: 900, openings: [{{slack: 5}}]", "opening 1, at least 4.50 x"),
+        (f"{WALL}, fit_height_mm: 900, openings: [{{}}, {{slack: 4}}]", "opening 2, at least 1.67 x 3.60 m, reaches beyond"),
+        (f"{WALL}, openings: [{{height_m: 2.4, slack: 5}}]", "from 1.2 m below the ground to 3 m above it"),
+        (f"{WALL}, fit_height_mm: 2000, top_m: 9, openings: [{{height_m: 0.8, slack: 2}}]", "reaches beyond the wall"),
+        (f"{WALL}, openings: [{{across_m: -2}}, {{across_m: 1.6}}]", "take at least 4.02 m side by side"),
+        (f"{WALL}, fit_width_mm: 1100, openings: [{{}}, {{}}, {{}}]", "take at least 4.10 m side"),
+        (f"{WALL}, openings: [{{{LOW}}}, {{shape: goku}}, {{{LOW}, shape: blob}}]", "openings 1 and 3 overlap"),
+        (f"{WALL}, openings: [{{across_m: 0, slack: 4}}, {{across_m: 1}}]", "openings 1 and 2 overlap"),
+        (f"{WALL}, half_width_m: 4, mural_m: 2, motion: {{kind: periodic, turn_deg: 45}}", "turns 2.8 m back"),
+        ("kind: room, behind_m: 4, length_m: 4", "behind_m must be less than length_m"),
+        (f"{ROOM}, pillars: [[5, 1, 0]]", "the pillar at 5, 1 m needs an edge"),
+        (f"{ROOM}, pillars: [[5, 1, 0.4], [5, -4.5, 0.4]]", "the pillar at 5, -4.5 m stands outside the room"),
+        (f"{ROOM}, pillars: [[18, 0, 0.4]]", "from -3 to 17 m along x, 4 m to both sides and 4 m up"),
+        (f"{ROOM}, pillars: [[0.4, 0.4, 0.4]]", "the pillar at 0.4, 0.4 m stands on the start"),
+        (f"{ROOM}, cube: {{waypoints: [{STAYS}, [12, 16.9, 0, 1.5]]}}", "the waypoint at 12 s takes the cube out"),
+        (f"{ROOM}, cube: {{waypoints: [{STAYS}, [12, -2.9, 0, 1.5]]}}", "the waypoint at 12 s takes the cube out"),
+        (f"{ROOM}, cube: {{waypoints: [{STAYS}, [12, 5, -3.9, 1.5]]}}", "the waypoint at 12 s takes the cube out"),
+        (f"{ROOM}, cube: {{waypoints: [{STAYS}, [12, 5, 0, 3.9]]}}", "the waypoint at 12 s takes the cube out"),
+        (f"{ROOM}, cube: {{scatter: 0.3, waypoints: [{STAYS}, [12, 12, 1, 1.5]]}}", "the waypoint at 12 s takes"),
+        (f"{ROOM}, cube: {{waypoints: [{STAYS}, [12, 5, 0, 0.1]]}}", "the waypoint at 12 s has the cube in the ground"),
+        (f"{ROOM}, cube: {{edge_mm: 1700, waypoints: [{STAYS}, [12, 6, 0, 1.5]]}}", "1.7 m, which stays 3.4 m up"),
+        (f"{ROOM}, pillars: [[6, 1, 0.4]], cube: {{waypoints: [{STAYS}, [12, 6, 0.7, 1.5]]}}", "cube in a pillar"),
+        (f"{ROOM}, cube: {{waypoints: [[9, 0.4, 0, 1.5], {STAYS.replace('9', '12')}]}}", "where the vehicle starts"),
+        (f"{FOREST}, trees_per_ha: 1500, gap_m: 3", "1500 trees per hectare cannot stand 3 m apart"),
+        (f"{FOREST}, undergrowth: {{bush_height_min_m: 2, bush_height_max_m: 1}}", "bush_height_min_m must not be greater"),
+        (f"{FOREST}, rows: [[8, -50, 8, 5]]", r"the row \[8.0, -50.0, 8.0, 5.0\] leaves the forest"),
+        (f"{FOREST}, rows: [[8, 5, 16, 5], [-2, 0.3, 5, 0.3]]", "stands on the start"),
+        (f"{FOREST}, rows: [[30.4, -5, 30.4, 5]]", "stands on the goal"),
+        (f"kind: mixed, forest: {{{FOREST}}}, gap: {{kind: gap, distance_m: 30}}", "the wall at 30 m must stand on the course"),
+        (f"kind: mixed, forest: {{{FOREST}}}, gap: {{kind: gap, distance_m: 25}}", "the mural at 30 m stands on the goal"),
+    ],
+)  # fmt: skip
+def test_a_world_that_cannot_be_is_refused_with_one_sentence(world: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as caught:
+        parse_model(f"world: {{{world}}}\n", WorldFile, "odd.yaml")
+    told = str(caught.value)
+    assert told.startswith("odd.yaml:1: world")
+    assert len(told.splitlines()) == 1
+    assert "found {" not in told
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        f"{WALL}, openings: [{{across_m: -1.5}}, {{across_m: 1.5}}]",
+        f"{WALL}, openings: [{{across_m: 0, height_m: 1.0}}, {{across_m: 0, height_m: 2.0}}]",
+        f"{WALL}, half_width_m: 4, mural_m: 2, motion: {{kind: none, turn_deg: 45}}",
+        f"{ROOM}, pillars: [[0.6, 0, 0.4], [16.9, 3.9, 0.4]]",
+        f"{ROOM}, cube: {{waypoints: [[9, 16.8, 3.8, 3.8], [12, -2.8, -3.8, 0.2]]}}",
+        f"{ROOM}, cube: {{waypoints: [[9, 0, 0, 3.5], [12, 5, 0, 1.5]]}}",
+        f"{FOREST}, goal: false, rows: [[30, -5, 30, 5]]",
+        f"kind: mixed, forest: {{{FOREST}}}, gap: {{kind: gap, distance_m: 27}}",
+    ],
+)
+def test_what_is_merely_tight_is_taken(world: str) -> None:
+    assert build_world(parse_model(f"world: {{{world}}}\n", WorldFile, "tight.yaml"), seed=1).scene.meshes
+
+
+def test_a_mixed_course_keeps_its_forest_s_heading_and_scatters_its_cube() -> None:
+    cube = "{scatter: 0.2, waypoints: [[0, 20, 0, 1.5], [9, 20, 0, 1.5]]}"
+    forest = f"{{{FOREST}, trees_per_ha: 0, heading_deg: 90}}"
+    text = f"world: {{kind: mixed, forest: {forest}, gap: {{kind: gap}}, cube: {cube}}}\n"
+    first, second = (build_world(parse_model(text, WorldFile, "mixed.yaml"), seed) for seed in (1, 2))
+    assert first.heading_rad == pytest.approx(math.pi / 2)
+    places = [next(thing for thing in world.scene.moving if thing.name == "cube") for world in (first, second)]
+    assert not np.allclose(places[0].T_ned_object(0.0), places[1].T_ned_object(0.0))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from morpheyes_daemon.config import Section
 from morpheyes_daemon.transforms import Array
@@ -32,6 +32,12 @@ class Pursue(Section):
     distance_m: float = Field(3.0, ge=1, le=30, description="kept from the camera to its visible face")
     gain_1_s: float = Field(0.8, gt=0, le=3, description="speed per metre of error")
     tolerance_m: float = Field(0.15, ge=0, le=3, description="within this the distance is right")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Pursue:
+        if self.tolerance_m >= self.distance_m:
+            raise ValueError("tolerance_m must be less than distance_m, or the object is never too near")
+        return self
 
 
 class Dodge(Section):

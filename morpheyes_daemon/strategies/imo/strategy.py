@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.control.baseline import baseline_for
@@ -59,6 +59,13 @@ class ImoParameters(StrategyParameters):
     )
     band_margin_m: float = Field(0.20, ge=0, le=3, description="room kept above and below")
     margin_m: float = Field(0.30, ge=0, le=3, description="room kept to obstacles on each side")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ImoParameters:
+        low_m, high_m = self.height_m
+        if not 0.3 < low_m <= high_m <= 20.0:
+            raise ValueError("height_m must be the lowest and then the highest flying height, from 0.3 to 20 m")
+        return self
 
 
 @dataclass(frozen=True, slots=True, eq=False)
