@@ -43,12 +43,20 @@ WHY = {
     ),
     "gap": (
         "Every opening is just large enough for the silhouette at a lean of 12° and 40 mm on every side; `small` ones "
-        "are to be refused. Success counts a crossing in which neither hull, bar nor propellers touch; where no opening "
-        "is large enough it counts the refusals."
+        "are to be refused. Success counts a crossing in which neither hull, bar nor propellers touch. Differences: "
+        "the paper shows crossings, we count them. A wall that sways is led by its wave, and where it turns back its "
+        "speed is small; one that moves irregularly has no such moment, and what it does in the second and a half of "
+        "the run nobody knows, which at 0.5 m/s is many times 40 mm. Without the eyes' mount measured, where they look "
+        "on the body is off by half a degree, which a swaying wall hides from the filter that takes it out before a "
+        "standing one."
     ),
     "imo": (
         "A detection counts only where this frame's own measurement lies within max(0.3 m, 5 %) of the visible face; "
-        "predictions of the filter do not."
+        "predictions of the filter do not. Differences: like the paper's, held eyes lose the object at one end, 0.3 m "
+        "apart they do not see it near (a disparity of 160 pixels is 1.4 m then), 0.1 m apart they lose it far away, "
+        "where a disparity of half a pixel is a metre. The first frames of every flight are lost by all: an object that "
+        "begins to move is believed after two frames, and at a few centimetres per second half a metre before the "
+        "eyes after two more, since the vehicle's own motion is not known better."
     ),
 }
 
