@@ -138,7 +138,7 @@ class Finder:
     def _see(self, candidate: _Candidate, frame: Frame, depth: DepthMap, dt_s: float) -> None:
         candidate.filter.predict(dt_s)
         lost = candidate.sighting is None
-        sighting = candidate.sighting = self._sighted(candidate, frame)
+        sighting = candidate.sighting = self._sighted(candidate, frame, lost)
         if sighting is None:
             return
         p_ned, covariance = _measured(sighting, candidate.radius_m, frame, depth)
@@ -153,9 +153,9 @@ class Finder:
             fresh = min(max(sighting.radius_m, SMALLEST_M), LARGEST_M)
             candidate.radius_m += RADIUS_GAIN * (fresh - candidate.radius_m)
 
-    def _sighted(self, candidate: _Candidate, frame: Frame) -> Sighting | None:
+    def _sighted(self, candidate: _Candidate, frame: Frame, lost: bool) -> Sighting | None:
         """Return the candidate as seen in a frame, a confirmed one also behind something nearer at its place."""
-        expected, lost = _expected(candidate, frame), candidate.sighting is None
+        expected = _expected(candidate, frame)
         sighting = sight(frame, expected)
         if sighting is None or not candidate.confirmed or not self._is_other(sighting, expected, lost):
             return sighting
@@ -163,14 +163,15 @@ class Finder:
         return None if behind is None or self._is_other(behind, expected, lost) else behind
 
     def _is_other(self, sighting: Sighting, expected: Expected, lost: bool) -> bool:
-        """Tell whether something else is seen: a piece of what is larger, or a scrap, before the object by its size.
+        """Tell whether something else is seen: a piece of what is larger, or a scrap, nearer by the object's size.
 
         An object that was out of sight is found again only as a thing by itself that does not stand.
         """
-        piece, before = sighting.joined >= JOINED, expected.p_rect[2] - sighting.p_rect[2] > 2.0 * expected.radius_m
+        piece = sighting.joined >= JOINED
         if lost and (piece or self._stands(sighting)):
             return True
-        return before and (piece or sighting.radius_m < SCRAP * expected.radius_m)
+        nearer = expected.p_rect[2] - sighting.p_rect[2] > 2.0 * expected.radius_m
+        return bool(nearer) and (piece or sighting.radius_m < SCRAP * expected.radius_m)
 
     def _adopt(self, frame: Frame, depth: DepthMap) -> None:
         """Tell candidates which clusters are theirs; make new candidates of the rest."""
