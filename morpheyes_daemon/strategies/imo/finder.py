@@ -129,8 +129,12 @@ class Finder:
         self._before, self._candidates, self.clusters = None, [], []
 
     def _own_shift(self, frame: Frame, best: _Candidate | None) -> Array | None:
-        """How far (3,) the object has moved by itself since the frame before, in the present rect axes."""
-        if best is None or self._before is None:
+        """How far (3,) the object has moved by itself since the frame before, in the present rect axes.
+
+        None on trial: corners that are looked for where a moving object's would be are found there, if its texture
+        repeats itself.
+        """
+        if best is None or not best.confirmed or self._before is None:
             return None
         dt_s = (frame.t_ns - self._before.t_ns) / S
         return np.asarray(frame.T_ned_rect[:3, :3].T @ best.filter.v_ned_m_s * dt_s)
