@@ -61,6 +61,8 @@ class ImageLimits:
     unlike_frames: int = 3
     unlike_of: int = 4
     unlike_rad: float = 1e-2
+    vouching_points: int = 16
+    vouching_rad: float = 1e-3
     apart_rad: float = 3.2e-3
     apart_frames: int = 5
     apart_of: int = 8
@@ -86,6 +88,9 @@ class AlikeCheck:
     rows are 12 mrad apart, which is as good as not found. One frame is no proof. Nor is it for rows that are apart by
     less: 2 ms between the eyes make 4 mrad in a quick pitch, in one frame of 20 of those flights; with 20 ms every
     second frame shows as much, and the calibration of another rig 5 mrad in all.
+
+    Few places are found again, too, where all that is seen is far, thin and hazy (0.2 of a sparse forest, with the eyes
+    together). Those that are found vouch for the eyes then, when there are some and their rows agree to a milliradian.
     """
 
     def __init__(self, limits: ImageLimits | None = None) -> None:
@@ -100,7 +105,9 @@ class AlikeCheck:
         """
         limits = self._limits
         astray = found.count >= MIN_POINTS and found.median_px > (limits.unlike_rad + doubt_rad) * f_px
-        unlike = found.tried >= limits.alike_points and (found.count < limits.alike_share * found.tried or astray)
+        vouch = found.count >= limits.vouching_points and found.median_px < limits.vouching_rad * f_px
+        few = found.count < limits.alike_share * found.tried and not vouch
+        unlike = found.tried >= limits.alike_points and (few or astray)
         unlike = unlike and _textured_share(left, limits.textured_levels) > limits.textured_share
         self._unlike.append(unlike)
         apart = found.count >= MIN_POINTS and found.median_px > (limits.apart_rad + doubt_rad) * f_px

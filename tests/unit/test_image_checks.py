@@ -163,6 +163,14 @@ def test_few_places_of_which_none_is_found_again_are_told(pair):
     assert [check.check(pair[0], fewer, F_PX) for _ in range(4)] == [set()] * 4, "too few to say"
 
 
+@pytest.mark.parametrize(("rows_px", "told"), [(0.0005 * F_PX, False), (0.002 * F_PX, True)])
+def test_few_places_that_are_found_again_vouch_for_the_eyes_when_their_rows_agree(pair, rows_px, told):
+    """All that is seen is far and hazy, or the few partners are false."""
+    few = RowOffsets(np.zeros((20, 2)), np.full(20, 3.0), np.full(20, rows_px), tried=90)
+    check = AlikeCheck()
+    assert [bool(check.check(pair[0], few, F_PX)) for _ in range(4)] == [False, False, told, told]
+
+
 def test_rows_far_apart_are_told_after_three_frames_like_eyes_that_see_different_things(pair):
     """Swapped eyes find false partners far off their rows."""
     left, right = pair
