@@ -151,7 +151,8 @@ class Gap(Strategy):
         if found is None:
             return
         opening, place = found
-        if self._phase is Phase.APPROACH and sure and self._passed_over.more_room(usable, place):
+        others = [other for other in usable if other is not opening]
+        if self._phase is Phase.APPROACH and sure and self._passed_over.more_room(others, place):
             self._track, self._room = PointTrack(self._yaw_rad), []
             return
         self._chosen = opening

@@ -95,10 +95,9 @@ class PassedOver:
     def __init__(self, frames: int) -> None:
         self._frames, self._seen = frames, 0
 
-    def more_room(self, openings: Sequence[Opening], followed: Place) -> bool:
-        """Tell whether another opening has had clearly more room in `frames` frames in a row, up to this one."""
-        rooms_m = (opening.places[0].clearance_m for opening in openings if not opening.cut)
-        roomiest_m = max(rooms_m, default=-math.inf)
+    def more_room(self, others: Sequence[Opening], followed: Place) -> bool:
+        """Tell whether one of the others has had clearly more room in `frames` frames in a row, up to this one."""
+        roomiest_m = max((other.places[0].clearance_m for other in others if not other.cut), default=-math.inf)
         self._seen = self._seen + 1 if roomiest_m > followed.clearance_m + BETTER_M else 0
         return self._seen >= self._frames
 

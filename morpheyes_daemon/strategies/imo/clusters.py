@@ -30,9 +30,10 @@ FEWEST = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cluster:
-    """Tracklets that move together: members, how many of them surely move, middle (3,) and velocity (3,) in rect axes,
+    """Tracklets that move together: middle (3,) and velocity (3,) in rect axes, and half its size.
 
-    and half its size."""
+    `count` says how many of its members surely move.
+    """
 
     members: Mask
     count: int

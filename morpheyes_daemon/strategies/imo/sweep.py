@@ -57,8 +57,8 @@ def _lowest(costs: FloatMap) -> FloatMap:
     at = np.argmin(costs, axis=0)
     padded = np.pad(costs, ((1, 1), (0, 0), (0, 0)), constant_values=np.inf)
     before, least, after = (np.take_along_axis(padded, (at + k)[None], axis=0)[0] for k in range(3))
-    steeper = np.maximum(before, after) - least
     with np.errstate(invalid="ignore"):
+        steeper = np.maximum(before, after) - least
         fraction = 0.5 * (before - after) / np.where(np.isfinite(steeper) & (steeper > 0.0), steeper, np.inf)
     fraction = np.where(np.isfinite(before) & np.isfinite(after), fraction, 0.0)
     return np.where(np.isfinite(least), at + fraction, np.nan).astype(np.float32)
