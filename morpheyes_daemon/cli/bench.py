@@ -42,7 +42,7 @@ def sticks(
     Exit code 1 when p99 is above 25 ms or any interval above 100 ms. On a virtual machine the host may take the
     processor away; intervals in which it took none are listed apart.
     """
-    from morpheyes_daemon.experiments.bench_realtime import bench_sticks
+    from morpheyes_daemon.benchmarks.soak import bench_sticks
 
     plan = _plan(size, calibration, rate_hz, minutes)
     found = _live(as_json, lambda show: bench_sticks(plan, minutes, show))
@@ -71,7 +71,7 @@ def soak(
 
     Exit code 1 when memory grew by 5 % or a task, thread or descriptor leaked.
     """
-    from morpheyes_daemon.experiments.bench_realtime import bench_soak
+    from morpheyes_daemon.benchmarks.soak import bench_soak
 
     plan = _plan(size, calibration, 5.0, minutes)
     found = _live(as_json, lambda show: bench_soak(plan, minutes, show))
@@ -97,7 +97,7 @@ def depth(
     size: Size = "640x480", repeats: Repeats = 30, calibration: Calibration = "exact", as_json: AsJson = False
 ) -> None:
     """Time a depth map beside OpenCV's own matcher on the same pairs."""
-    from morpheyes_daemon.experiments.bench_vision import bench_depth
+    from morpheyes_daemon.benchmarks.vision_latency import bench_depth
 
     plan = _plan(size, calibration, 5.0, 1.0)
     with progress_line() as report:
@@ -116,7 +116,7 @@ def latency(
     size: Size = "640x480", repeats: Repeats = 50, calibration: Calibration = "exact", as_json: AsJson = False
 ) -> None:
     """Time frames through the vision worker, beside the latency that lockstep reckons with."""
-    from morpheyes_daemon.experiments.bench_vision import bench_latency
+    from morpheyes_daemon.benchmarks.vision_latency import bench_latency
 
     plan = _plan(size, calibration, 5.0, 1.0)
     with progress_line() as report:
@@ -158,7 +158,7 @@ def takeover(
 @app.command()
 def render(size: Size = "640x480", repeats: Repeats = 20, as_json: AsJson = False) -> None:
     """Time the simulator's rendering of a stereo pair."""
-    from morpheyes_daemon.experiments.bench_vision import bench_render
+    from morpheyes_daemon.benchmarks.vision_latency import bench_render
 
     plan = _plan(size, "exact", 5.0, 1.0)
     with progress_line() as report:

@@ -24,7 +24,7 @@ def gap(
     from morpheyes_daemon.cli.progress import progress_line
 
     require_simulator()
-    from morpheyes_daemon.experiments.bench_gap import bench_gap
+    from morpheyes_daemon.benchmarks.gap_detection import bench_gap
     from morpheyes_daemon.experiments.plan import make_plan
 
     with progress_line() as report:
@@ -47,7 +47,7 @@ def gap_images(
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON and nothing else.")] = False,
 ) -> None:
     """Find the gap in GapFlyt's real frames and compare its contour with masks drawn by hand."""
-    from morpheyes_daemon.experiments.gap_images import gap_images as judge_images
+    from morpheyes_daemon.benchmarks.gap_on_real_images import gap_images as judge_images
 
     found = judge_images(data or Path(os.environ.get("MORPHEYES_DATA", "../shared/data")))
     if as_json:

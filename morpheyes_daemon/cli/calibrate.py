@@ -133,8 +133,8 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Compare a solved file with the truth of the simulator's rig, at 41 baselines."""
+    from morpheyes_daemon.benchmarks.calibration_error import compare_separate, evaluate_rig, twin_of
     from morpheyes_daemon.cli.progress import progress_line
-    from morpheyes_daemon.experiments.rig_truth import compare_separate, evaluate_rig, twin_of
     from morpheyes_daemon.stereo.rig import RigModel
 
     rig = RigModel.load(file)
@@ -151,7 +151,7 @@ def evaluate(
         from morpheyes_daemon.cli.extras import require_simulator
 
         require_simulator()
-        from morpheyes_daemon.experiments.drift_trial import watch_figures
+        from morpheyes_daemon.benchmarks.online_calibration import watch_figures
 
         with progress_line() as progress:
             figures["watch"] = watch_figures(rig, twin.seed, progress)

@@ -25,7 +25,7 @@ def command(
     import json
 
     from morpheyes_daemon.clock import stopwatch_s
-    from morpheyes_daemon.experiments.still_images import read_pair, write_depth
+    from morpheyes_daemon.stereo.image_files import read_pair, write_depth
     from morpheyes_daemon.stereo.rig import RigModel
     from morpheyes_daemon.stereo.still import raw_depth, rectified_depth
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.experiments.bench_vision import Times
+    from morpheyes_daemon.benchmarks.vision_latency import Times
 
 
 def say(document: dict[str, Any], rows: Sequence[tuple[str, str]], as_json: bool) -> None:

@@ -164,7 +164,7 @@ def fly_one(plan: FlightPlan, key: str, folder: Path | None = None) -> Row:
 def _try_one(mode: str, plan: FlightPlan, key: str, folder: Path | None = None) -> Row | Failure:
     try:
         return fly_one(plan, key, folder)
-    except Exception as error:  # noqa: BLE001 -- the worker's task boundary
+    except Exception as error:
         return Failure(mode, plan.scenario.seed, mistake(error))
 
 
@@ -228,7 +228,7 @@ def _fly_on(scheduler: str, plans: Sequence[tuple[str, FlightPlan]], key: str) -
         for flight in as_completed(flights):  # type: ignore[no-untyped-call]
             try:
                 flown = flight.result()
-            except Exception as error:  # noqa: BLE001 -- whatever became of a worker
+            except Exception as error:
                 flown = Failure(*flights[flight], f"{type(error).__name__}: {error}")
             flight.release()  # or a worker that dies has all that it ever flew flown again
             yield flown

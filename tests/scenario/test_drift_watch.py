@@ -2,7 +2,7 @@
 
 import pytest
 
-from morpheyes_daemon.experiments.drift_trial import FRAMES, drift_trial, late_trials
+from morpheyes_daemon.benchmarks.online_calibration import FRAMES, drift_trial, late_trials
 from morpheyes_daemon.simulation.rig_twin import RigTwin
 
 pytestmark = pytest.mark.slow

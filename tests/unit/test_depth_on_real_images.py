@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from morpheyes_daemon.experiments.bench_depth import (
+from morpheyes_daemon.benchmarks.depth_accuracy import (
     CONES_STEPS,
     MOTORCYCLE_BASELINE_M,
     MOTORCYCLE_DOFFS_PX,

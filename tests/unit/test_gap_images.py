@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from real_images import real_images
 
+from morpheyes_daemon.benchmarks.gap_on_real_images import focus_of_expansion, gap_images, largest_hole, read_flo
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.experiments.gap_images import focus_of_expansion, gap_images, largest_hole, read_flo
 
 
 @pytest.mark.realdata

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from morpheyes_daemon.benchmarks.calibration_error import true_projections
 from morpheyes_daemon.calibration.rail import fit_rail
 from morpheyes_daemon.calibration.rectified import row_error_px
 from morpheyes_daemon.calibration.solver import calibrate
 from morpheyes_daemon.calibration.validation import geometry_at, held_out, leave_one_out
-from morpheyes_daemon.experiments.rig_truth import true_projections
 from tests.synthetic_rig import TEN_M, observations, true_geometry
 
 

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from morpheyes_daemon.benchmarks.calibration_error import evaluate_rig
 from morpheyes_daemon.calibration.drift import DriftLimits, DriftMonitor, DriftReport
 from morpheyes_daemon.calibration.ego_motion import EyeMotion, eye_motion
 from morpheyes_daemon.calibration.views import Progress, silent
 from morpheyes_daemon.calibration.yaw_watch import STILL, Uncertain
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config import Mount, ServoMotion
-from morpheyes_daemon.experiments.rig_truth import evaluate_rig
 from morpheyes_daemon.messages import BaselineEstimate, StereoFrame, VehicleState
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.renderer import Renderer

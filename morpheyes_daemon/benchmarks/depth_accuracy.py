@@ -14,12 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from morpheyes_daemon.benchmarks.vision_latency import opencv_matcher
 from morpheyes_daemon.clock import stopwatch_s
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.experiments.bench_vision import opencv_matcher
-from morpheyes_daemon.experiments.still_images import read_picture
 from morpheyes_daemon.messages import FloatMap, Image
 from morpheyes_daemon.stereo.depth import grey
+from morpheyes_daemon.stereo.image_files import read_picture
 from morpheyes_daemon.stereo.matching import SUBPIXELS, match
 
 CONES_STEPS = (1, 3, 4, 5, 6)
