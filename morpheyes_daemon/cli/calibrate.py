@@ -67,8 +67,8 @@ def report(
     sideways_m_s: Annotated[float, typer.Option("--sideways", min=0, max=20, help="Sideways speed, m/s.")] = 0.5,
 ) -> None:
     """Write a page that shows how good a calibration is, what depth errors to expect, and what to retake."""
-    from morpheyes_daemon.calibration.budget import Conditions
-    from morpheyes_daemon.calibration.report import write_report
+    from morpheyes_daemon.calibration.report.depth_error_budget import Conditions
+    from morpheyes_daemon.calibration.report.html import write_report
     from morpheyes_daemon.stereo.rig import RigModel
 
     page = file.with_suffix(".html") if out is None else out

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from morpheyes_daemon.calibration import report_figures as figures
-from morpheyes_daemon.calibration.budget import Conditions
+from morpheyes_daemon.calibration.report import figures
+from morpheyes_daemon.calibration.report.depth_error_budget import Conditions
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.stereo.rig import RigModel
 

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from morpheyes_daemon.calibration.budget import DISTANCES_M, Conditions, depth_errors
+from morpheyes_daemon.calibration.report.depth_error_budget import DISTANCES_M, Conditions, depth_errors
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
 from morpheyes_daemon.transforms import rpy_from_R
 
