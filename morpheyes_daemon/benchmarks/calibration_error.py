@@ -16,9 +16,14 @@ import numpy as np
 from morpheyes_daemon.calibration.boards import Board
 from morpheyes_daemon.calibration.detection import observe
 from morpheyes_daemon.calibration.folder import read_folder
-from morpheyes_daemon.calibration.rectified import StereoGeometry, image_grid, infinity_px, row_error_px
-from morpheyes_daemon.calibration.result import rig_model
-from morpheyes_daemon.calibration.solver import solve_separately
+from morpheyes_daemon.calibration.solver.rectification_residuals import (
+    StereoGeometry,
+    image_grid,
+    infinity_px,
+    row_error_px,
+)
+from morpheyes_daemon.calibration.solver.result import rig_model
+from morpheyes_daemon.calibration.solver.solver import solve_separately
 from morpheyes_daemon.calibration.views import Progress, silent
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.experiments.rendered_boards import twin_from_name

@@ -24,7 +24,7 @@ from morpheyes_daemon.cli.calibrate_mount import mount
 
 if TYPE_CHECKING:
     from morpheyes_daemon.calibration.boards import Board
-    from morpheyes_daemon.calibration.result import Solved
+    from morpheyes_daemon.calibration.solver.result import Solved
 
 app = typer.Typer(help="Calibrate the stereo rig and check it.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -41,7 +41,7 @@ def solve(
     """Solve all baselines together from pictures of a board and write the calibration file."""
     import datetime
 
-    from morpheyes_daemon.calibration.folder_solve import read_board_file, solve_folder
+    from morpheyes_daemon.calibration.solver.pipeline import read_board_file, solve_folder
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.clock import wall_time_s
 
@@ -96,7 +96,7 @@ def render(
 ) -> None:
     """Render boards before the simulator's camera, as folders that `solve` takes."""
     from morpheyes_daemon.calibration.guide import BASELINE_VIEWS
-    from morpheyes_daemon.calibration.mount import MOUNT_VIEWS
+    from morpheyes_daemon.calibration.solver.mount import MOUNT_VIEWS
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.experiments.rendered_boards import (
         DEFAULT_BOARD,
@@ -142,7 +142,7 @@ def evaluate(
     truth = evaluate_rig(rig, twin)
     figures: dict[str, Any] = truth.figures()
     if separate is not None:
-        from morpheyes_daemon.calibration.folder_solve import read_board_file
+        from morpheyes_daemon.calibration.solver.pipeline import read_board_file
 
         chosen = choose_board(read_board_file(separate), None, None, None)
         with progress_line() as progress:

@@ -13,7 +13,7 @@ import typer
 from morpheyes_daemon.cli.calibrate_live import BoardOption, ConfigOption, JsonOption, MarkerOption, SquareOption
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.calibration.mount import MountSolution, MountViews
+    from morpheyes_daemon.calibration.solver.mount import MountSolution, MountViews
 
 
 def mount(
@@ -32,8 +32,8 @@ def mount(
     """
     from dataclasses import replace
 
-    from morpheyes_daemon.calibration.folder_solve import read_board_file
-    from morpheyes_daemon.calibration.mount import read_mount_folder, solve_mount, ways_up
+    from morpheyes_daemon.calibration.solver.mount import read_mount_folder, solve_mount, ways_up
+    from morpheyes_daemon.calibration.solver.pipeline import read_board_file
     from morpheyes_daemon.cli.calibrate import choose_board
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.perception import build_craft

@@ -18,7 +18,7 @@ import yaml
 
 from morpheyes_daemon.calibration.boards import Board, aligned, find_corners
 from morpheyes_daemon.calibration.guide import BASELINE_VIEWS
-from morpheyes_daemon.calibration.mount import ATTITUDES, COLUMNS, MOUNT_VIEWS, MountViews, board_rotation
+from morpheyes_daemon.calibration.solver.mount import ATTITUDES, COLUMNS, MOUNT_VIEWS, MountViews, board_rotation
 from morpheyes_daemon.calibration.views import Observations, Progress, silent
 from morpheyes_daemon.config import ServoMotion
 from morpheyes_daemon.errors import InputError

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from morpheyes_daemon.calibration.mount import solve_mount, ways_up
-from morpheyes_daemon.calibration.result import rig_model
-from morpheyes_daemon.calibration.solver import calibrate
+from morpheyes_daemon.calibration.solver.mount import solve_mount, ways_up
+from morpheyes_daemon.calibration.solver.result import rig_model
+from morpheyes_daemon.calibration.solver.solver import calibrate
 from morpheyes_daemon.calibration.views import Progress, silent
 from morpheyes_daemon.config import Mount
 from morpheyes_daemon.errors import CalibrationError

@@ -18,7 +18,7 @@ import numpy as np
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.calibration.boards import Board, find_corners
-from morpheyes_daemon.calibration.mount import ATTITUDES, COLUMNS, attitude_rows
+from morpheyes_daemon.calibration.solver.mount import ATTITUDES, COLUMNS, attitude_rows
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config import VehicleConfig
 from morpheyes_daemon.devices.autopilot.hub import AutopilotHub

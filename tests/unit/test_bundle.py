@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime, least_squares
 
-from morpheyes_daemon.calibration import bundle
-from morpheyes_daemon.calibration.projection import camera_vector, project
-from morpheyes_daemon.calibration.rectified import infinity_px
-from morpheyes_daemon.calibration.solver import calibrate, camera_prior, solve_separately
-from morpheyes_daemon.calibration.start import first_guess
-from morpheyes_daemon.calibration.uncertainty import baseline_uncertainty
-from morpheyes_daemon.calibration.validation import geometry_at
+from morpheyes_daemon.calibration.solver import bundle_adjustment as bundle
+from morpheyes_daemon.calibration.solver.cross_validation import geometry_at
+from morpheyes_daemon.calibration.solver.initial_guess import first_guess
+from morpheyes_daemon.calibration.solver.projection import camera_vector, project
+from morpheyes_daemon.calibration.solver.rectification_residuals import infinity_px
+from morpheyes_daemon.calibration.solver.solver import calibrate, camera_prior, solve_separately
+from morpheyes_daemon.calibration.solver.uncertainty import baseline_uncertainty
 from tests.synthetic_rig import CAM0, CAM1, TEN_M, observations, true_geometry, true_pose
 
 THREE_M = np.array([0.1, 0.2, 0.3])

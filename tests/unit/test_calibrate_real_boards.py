@@ -3,7 +3,7 @@
 import pytest
 
 from morpheyes_daemon.calibration.boards import parse_board
-from morpheyes_daemon.calibration.folder_solve import solve_folder
+from morpheyes_daemon.calibration.solver.pipeline import solve_folder
 from tests.real_images import real_images
 
 pytestmark = pytest.mark.realdata

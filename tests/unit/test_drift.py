@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from morpheyes_daemon.calibration.drift import Drift, DriftMonitor, rows_apart_rad, turned_rig
 from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates, row_rates
-from morpheyes_daemon.calibration.rectified import StereoGeometry, infinity_px
+from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px
 from morpheyes_daemon.calibration.yaw_watch import leverage
 from morpheyes_daemon.messages import BaselineEstimate, Pinhole, StereoFrame
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.calibration.boards import Board
-from morpheyes_daemon.calibration.mount import ATTITUDES, attitude_rows
+from morpheyes_daemon.calibration.solver.mount import ATTITUDES, attitude_rows
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages import RawPair, VehicleState
 from morpheyes_daemon.simulation.board_twin import BoardTwin

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.benchmarks.calibration_error import true_projections
-from morpheyes_daemon.calibration.rail import fit_rail
-from morpheyes_daemon.calibration.rectified import row_error_px
-from morpheyes_daemon.calibration.solver import calibrate
-from morpheyes_daemon.calibration.validation import geometry_at, held_out, leave_one_out
+from morpheyes_daemon.calibration.solver.cross_validation import geometry_at, held_out, leave_one_out
+from morpheyes_daemon.calibration.solver.rail_model import fit_rail
+from morpheyes_daemon.calibration.solver.rectification_residuals import row_error_px
+from morpheyes_daemon.calibration.solver.solver import calibrate
 from tests.synthetic_rig import TEN_M, observations, true_geometry
 
 

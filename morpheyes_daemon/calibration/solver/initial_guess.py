@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.boards import Board
-from morpheyes_daemon.calibration.bundle import RigState
-from morpheyes_daemon.calibration.projection import camera_from_vector
+from morpheyes_daemon.calibration.solver.bundle_adjustment import RigState
+from morpheyes_daemon.calibration.solver.projection import camera_from_vector
 from morpheyes_daemon.calibration.views import Observations
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.calibration.projection import project
+from morpheyes_daemon.calibration.solver.projection import project
 from morpheyes_daemon.calibration.views import Observations
 from morpheyes_daemon.transforms import Array, R_from_rotvec, skew
 

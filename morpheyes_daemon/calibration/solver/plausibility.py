@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.calibration.rectified import StereoGeometry
-from morpheyes_daemon.calibration.solver import Calibration
-from morpheyes_daemon.calibration.validation import geometry_at
+from morpheyes_daemon.calibration.solver.cross_validation import geometry_at
+from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry
+from morpheyes_daemon.calibration.solver.solver import Calibration
 from morpheyes_daemon.transforms import Array
 
 SCALE_TOLERANCE = 0.03

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from morpheyes_daemon.calibration import bundle
-from morpheyes_daemon.calibration.bundle import EYES, POSE, Prior, RigState
-from morpheyes_daemon.calibration.projection import camera_vector
-from morpheyes_daemon.calibration.start import board_pose
+from morpheyes_daemon.calibration.solver import bundle_adjustment as bundle
+from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE, Prior, RigState
+from morpheyes_daemon.calibration.solver.initial_guess import board_pose
+from morpheyes_daemon.calibration.solver.projection import camera_vector
 from morpheyes_daemon.calibration.views import Observations, Progress, silent
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.stereo.rig import RigModel

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.calibration.boards import Board, find_corners
-from morpheyes_daemon.calibration.start import board_pose
+from morpheyes_daemon.calibration.solver.initial_guess import board_pose
 from morpheyes_daemon.calibration.views import Progress, silent
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.messages import Image

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.calibration import bundle
-from morpheyes_daemon.calibration.bundle import EYES, POSE, Prior, RigState, Solution
-from morpheyes_daemon.calibration.outliers import Outlier, find_outliers, without, without_strays
-from morpheyes_daemon.calibration.rail import Rail, fit_rail, with_rail
-from morpheyes_daemon.calibration.start import first_guess
+from morpheyes_daemon.calibration.solver import bundle_adjustment as bundle
+from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE, Prior, RigState, Solution
+from morpheyes_daemon.calibration.solver.initial_guess import first_guess
+from morpheyes_daemon.calibration.solver.outliers import Outlier, find_outliers, without, without_strays
+from morpheyes_daemon.calibration.solver.rail_model import Rail, fit_rail, with_rail
 from morpheyes_daemon.calibration.views import Observations, Progress, silent
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.calibration.bundle import EYES, POSE
-from morpheyes_daemon.calibration.projection import CAMERA_PARAMETERS, camera_from_vector
-from morpheyes_daemon.calibration.rectified import StereoGeometry, infinity_px
-from morpheyes_daemon.calibration.solver import Calibration
+from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE
+from morpheyes_daemon.calibration.solver.projection import CAMERA_PARAMETERS, camera_from_vector
+from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px
+from morpheyes_daemon.calibration.solver.solver import Calibration
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
 
 _STEP = 1e-2

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.calibration.bundle import EYES, POSE, Prior
+from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE, Prior
 from morpheyes_daemon.transforms import Array
 
 COMPONENTS = ("rotation_x", "rotation_y", "rotation_z", "x", "y", "z")
