@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.calibration.boards import Board
 from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry
-from morpheyes_daemon.calibration.views import Observations
+from morpheyes_daemon.calibration.targets.boards import Board
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
 

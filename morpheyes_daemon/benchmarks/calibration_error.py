@@ -13,9 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.calibration.boards import Board
-from morpheyes_daemon.calibration.detection import observe
-from morpheyes_daemon.calibration.folder import read_folder
 from morpheyes_daemon.calibration.solver.rectification_residuals import (
     StereoGeometry,
     image_grid,
@@ -24,7 +21,10 @@ from morpheyes_daemon.calibration.solver.rectification_residuals import (
 )
 from morpheyes_daemon.calibration.solver.result import rig_model
 from morpheyes_daemon.calibration.solver.solver import solve_separately
-from morpheyes_daemon.calibration.views import Progress, silent
+from morpheyes_daemon.calibration.targets.boards import Board
+from morpheyes_daemon.calibration.targets.detection import observe
+from morpheyes_daemon.calibration.targets.image_pairs import read_folder
+from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.experiments.rendered_boards import twin_from_name
 from morpheyes_daemon.simulation.rig_twin import RANGE_M, RigTwin

@@ -16,7 +16,7 @@ import numpy as np
 from morpheyes_daemon.benchmarks.calibration_error import evaluate_rig
 from morpheyes_daemon.calibration.drift import DriftLimits, DriftMonitor, DriftReport
 from morpheyes_daemon.calibration.ego_motion import EyeMotion, eye_motion
-from morpheyes_daemon.calibration.views import Progress, silent
+from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.calibration.yaw_watch import STILL, Uncertain
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config import Mount, ServoMotion

@@ -23,8 +23,8 @@ from morpheyes_daemon.cli.calibrate_live import (
 from morpheyes_daemon.cli.calibrate_mount import mount
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.calibration.boards import Board
     from morpheyes_daemon.calibration.solver.result import Solved
+    from morpheyes_daemon.calibration.targets.boards import Board
 
 app = typer.Typer(help="Calibrate the stereo rig and check it.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -95,8 +95,8 @@ def render(
     marker_mm: MarkerOption = None,
 ) -> None:
     """Render boards before the simulator's camera, as folders that `solve` takes."""
-    from morpheyes_daemon.calibration.guide import BASELINE_VIEWS
     from morpheyes_daemon.calibration.solver.mount import MOUNT_VIEWS
+    from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.experiments.rendered_boards import (
         DEFAULT_BOARD,
@@ -192,7 +192,7 @@ def choose_board(
     checked: bool = True,
 ) -> Board:
     """Return the board from the options or else from what the folder says; raises UsageError when they disagree."""
-    from morpheyes_daemon.calibration.boards import parse_board
+    from morpheyes_daemon.calibration.targets.boards import parse_board
     from morpheyes_daemon.errors import UsageError
 
     written = known.get("square_mm")

@@ -50,9 +50,9 @@ def capture(
     """
     import asyncio
 
-    from morpheyes_daemon.calibration.guide import BASELINE_VIEWS
     from morpheyes_daemon.calibration.solver.mount import MOUNT_VIEWS
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file
+    from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
     from morpheyes_daemon.cli.calibrate import choose_baselines_m, choose_board
     from morpheyes_daemon.clock import running_clock
     from morpheyes_daemon.devices.link import open_link
@@ -130,10 +130,10 @@ def repeatability(
     as_json: JsonOption = False,
 ) -> None:
     """Show target against achieved baseline: mean and 10 sigma band over the visits, as in the paper's figure."""
-    from morpheyes_daemon.calibration.detection import observe
-    from morpheyes_daemon.calibration.folder import read_folder
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file
     from morpheyes_daemon.calibration.solver.repeatability import draw, figures, positions
+    from morpheyes_daemon.calibration.targets.detection import observe
+    from morpheyes_daemon.calibration.targets.image_pairs import read_folder
     from morpheyes_daemon.cli.calibrate import choose_board
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.stereo.rig import RigModel
@@ -178,7 +178,7 @@ def _check_recorded(rig: Any, folder: Path, baseline_mm: float | None, progress:
 
 
 def _recorded_pairs(folder: Path) -> Iterator[tuple[float | None, Image, Image]]:
-    from morpheyes_daemon.calibration.folder import read_folder, read_pair
+    from morpheyes_daemon.calibration.targets.image_pairs import read_folder, read_pair
 
     folders, _ = read_folder(folder)
     for one in folders:

@@ -6,7 +6,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from morpheyes_daemon.calibration.views import Progress, silent
+from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.config import VehicleConfig
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.experiments.flight import FlightPlan, sim_config

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 import yaml
 
-from morpheyes_daemon.calibration.boards import Board, aligned, find_corners
-from morpheyes_daemon.calibration.guide import BASELINE_VIEWS
 from morpheyes_daemon.calibration.solver.mount import ATTITUDES, COLUMNS, MOUNT_VIEWS, MountViews, board_rotation
-from morpheyes_daemon.calibration.views import Observations, Progress, silent
+from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners
+from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
+from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
 from morpheyes_daemon.config import ServoMotion
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages import RawPair

@@ -17,8 +17,8 @@ from typing import Self
 import numpy as np
 
 from morpheyes_daemon.bus import EventLog, Topics
-from morpheyes_daemon.calibration.boards import Board, find_corners
 from morpheyes_daemon.calibration.solver.mount import ATTITUDES, COLUMNS, attitude_rows
+from morpheyes_daemon.calibration.targets.boards import Board, find_corners
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config import VehicleConfig
 from morpheyes_daemon.devices.autopilot.hub import AutopilotHub

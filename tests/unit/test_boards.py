@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.boards import Board, aligned, find_corners, parse_board
-from morpheyes_daemon.calibration.saddle import saddle_points
+from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners, parse_board
+from morpheyes_daemon.calibration.targets.subpixel import saddle_points
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.simulation.board_twin import BoardTwin, draw_poses
 from morpheyes_daemon.simulation.rig_twin import RigTwin

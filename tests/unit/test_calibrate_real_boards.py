@@ -2,8 +2,8 @@
 
 import pytest
 
-from morpheyes_daemon.calibration.boards import parse_board
 from morpheyes_daemon.calibration.solver.pipeline import solve_folder
+from morpheyes_daemon.calibration.targets.boards import parse_board
 from tests.real_images import real_images
 
 pytestmark = pytest.mark.realdata

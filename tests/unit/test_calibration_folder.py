@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.boards import Board
-from morpheyes_daemon.calibration.detection import CornerCache, observe
-from morpheyes_daemon.calibration.folder import read_folder
+from morpheyes_daemon.calibration.targets.boards import Board
+from morpheyes_daemon.calibration.targets.detection import CornerCache, observe
+from morpheyes_daemon.calibration.targets.image_pairs import read_folder
 from morpheyes_daemon.errors import InputError
 
 BOARD = Board(9, 6, 0.025)

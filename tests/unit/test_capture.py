@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.boards import Board
+from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages import RawPair
 from morpheyes_daemon.simulation.board_twin import BoardTwin

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.boards import Board
 from morpheyes_daemon.calibration.solver.mount import ATTITUDES, MountViews, read_mount_folder, solve_mount, ways_up
+from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.config import Mount
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.experiments.rendered_boards import render_mount_folder

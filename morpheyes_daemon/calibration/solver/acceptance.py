@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.calibration.coverage import coverage, empty_corners
 from morpheyes_daemon.calibration.solver.cross_validation import HeldOut, LeftOutBaseline
 from morpheyes_daemon.calibration.solver.plausibility import ScaleCheck
 from morpheyes_daemon.calibration.solver.solver import Calibration
 from morpheyes_daemon.calibration.solver.uncertainty import BaselineUncertainty
+from morpheyes_daemon.calibration.targets.coverage import coverage, empty_corners
 
 HELD_OUT_GOOD_PX, HELD_OUT_LIMIT_PX = 0.5, 1.0
 """Held-out row error, 95th percentile: factory rigs stay under the first; matching suffers from the second on."""

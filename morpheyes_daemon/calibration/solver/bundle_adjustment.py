@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.solver.projection import project
-from morpheyes_daemon.calibration.views import Observations
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.transforms import Array, R_from_rotvec, skew
 
 EYES = 20

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.calibration.boards import Board
 from morpheyes_daemon.calibration.solver.bundle_adjustment import RigState
 from morpheyes_daemon.calibration.solver.projection import camera_from_vector
-from morpheyes_daemon.calibration.views import Observations
+from morpheyes_daemon.calibration.targets.boards import Board
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.transforms import Array, R_from_rotvec, inverse, pose, rotvec_from_R

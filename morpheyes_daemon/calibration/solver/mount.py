@@ -16,9 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morpheyes_daemon.calibration.boards import Board, find_corners
 from morpheyes_daemon.calibration.solver.initial_guess import board_pose
-from morpheyes_daemon.calibration.views import Progress, silent
+from morpheyes_daemon.calibration.targets.boards import Board, find_corners
+from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.messages import Image
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics

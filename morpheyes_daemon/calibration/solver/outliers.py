@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.calibration.boards import spacing_px
 from morpheyes_daemon.calibration.solver.bundle_adjustment import Solution
 from morpheyes_daemon.calibration.solver.initial_guess import board_pose
 from morpheyes_daemon.calibration.solver.projection import camera_from_vector
-from morpheyes_daemon.calibration.views import Observations
+from morpheyes_daemon.calibration.targets.boards import spacing_px
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.transforms import Array
 
 _SUSPECT = 4.0

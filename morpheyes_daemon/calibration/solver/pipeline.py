@@ -13,16 +13,16 @@ from typing import Any
 
 import yaml
 
-from morpheyes_daemon.calibration.boards import Board
-from morpheyes_daemon.calibration.detection import CornerCache, observe
-from morpheyes_daemon.calibration.folder import read_folder
 from morpheyes_daemon.calibration.solver.acceptance import judge
 from morpheyes_daemon.calibration.solver.cross_validation import held_out, leave_one_out
 from morpheyes_daemon.calibration.solver.plausibility import ScaleCheck, misnamed, scale_check
 from morpheyes_daemon.calibration.solver.result import Solved, details, rig_model
 from morpheyes_daemon.calibration.solver.solver import Calibration, calibrate
 from morpheyes_daemon.calibration.solver.uncertainty import baseline_uncertainty
-from morpheyes_daemon.calibration.views import Observations, Progress, silent
+from morpheyes_daemon.calibration.targets.boards import Board
+from morpheyes_daemon.calibration.targets.detection import CornerCache, observe
+from morpheyes_daemon.calibration.targets.image_pairs import read_folder
+from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
 from morpheyes_daemon.errors import CalibrationError
 
 CORNERS_SUFFIX = ".corners.npz"

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.calibration.coverage import CELLS, cell_of, coverage
 from morpheyes_daemon.calibration.solver.acceptance import Verdict
 from morpheyes_daemon.calibration.solver.cross_validation import HeldOut, LeftOutBaseline
 from morpheyes_daemon.calibration.solver.plausibility import ScaleCheck
 from morpheyes_daemon.calibration.solver.projection import camera_from_vector
 from morpheyes_daemon.calibration.solver.solver import Calibration
 from morpheyes_daemon.calibration.solver.uncertainty import BaselineUncertainty, baseline_uncertainty, camera_uncertainty
+from morpheyes_daemon.calibration.targets.coverage import CELLS, cell_of, coverage
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.calibration.views import Observations
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.transforms import Array
 
 CELLS = (8, 6)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.calibration.boards import Board, aligned, find_corners, spacing_px
-from morpheyes_daemon.calibration.coverage import CELLS, cell_of, count_cells, empty_corners
+from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners, spacing_px
+from morpheyes_daemon.calibration.targets.coverage import CELLS, cell_of, count_cells, empty_corners
 from morpheyes_daemon.messages import Image
 from morpheyes_daemon.transforms import Array
 

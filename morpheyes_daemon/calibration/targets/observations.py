@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.calibration.boards import Board
+from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.transforms import Array
 
 Progress = Callable[[str, int, int], None]

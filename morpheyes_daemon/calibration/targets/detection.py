@@ -18,9 +18,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morpheyes_daemon.calibration.boards import Board, aligned, find_corners
-from morpheyes_daemon.calibration.folder import BaselineFolder, PairFiles
-from morpheyes_daemon.calibration.views import Observations, Progress, silent
+from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners
+from morpheyes_daemon.calibration.targets.image_pairs import BaselineFolder, PairFiles
+from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages import Image
 from morpheyes_daemon.transforms import Array

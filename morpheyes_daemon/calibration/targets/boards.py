@@ -15,7 +15,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from morpheyes_daemon.calibration.saddle import saddle_points
+from morpheyes_daemon.calibration.targets.subpixel import saddle_points
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.messages import Image
 from morpheyes_daemon.transforms import Array

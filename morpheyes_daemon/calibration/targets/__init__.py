@@ -1,0 +1,1 @@
+"""Calibration boards in images: finding them, refining corners, pairing pictures, coverage."""
