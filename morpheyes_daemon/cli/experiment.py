@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.experiments.flight_table import Row
+    from morpheyes_daemon.campaigns.forest_table import Row
 
 
 def command(
@@ -43,8 +43,8 @@ def command(
     from morpheyes_daemon.cli.progress import progress_line
 
     require_simulator()
-    from morpheyes_daemon.experiments.campaign import Campaign, parse_baselines, parse_seeds, require_jobs, run_campaign
-    from morpheyes_daemon.experiments.campaign_results import RESULTS
+    from morpheyes_daemon.campaigns.results import RESULTS
+    from morpheyes_daemon.campaigns.runner import Campaign, parse_baselines, parse_seeds, require_jobs, run_campaign
     from morpheyes_daemon.experiments.plan import make_plan
 
     modes, numbers = parse_baselines(baselines), parse_seeds(seeds)

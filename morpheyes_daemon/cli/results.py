@@ -13,6 +13,6 @@ def command(
     out: Annotated[Path, typer.Option(help="Page to write; its other parts are kept.")] = Path("docs/results.md"),
 ) -> None:
     """Write the missions' part of a results page from campaigns: what the paper says, what came out, why."""
-    from morpheyes_daemon.experiments.results_page import write_page
+    from morpheyes_daemon.campaigns.results_page import write_page
 
     typer.echo(write_page(folders, out))

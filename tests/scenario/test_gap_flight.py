@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("numba", reason="the renderer needs the extra `sim`")
 
 from morpheyes_daemon.benchmarks.gap_detection import GapBencher, gap_view
-from morpheyes_daemon.experiments.campaign import fly_one
+from morpheyes_daemon.campaigns.runner import fly_one
 from morpheyes_daemon.experiments.plan import make_plan
 
 FIT_M = 0.040

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from morpheyes_daemon.cli import main
-from morpheyes_daemon.errors import InputError, MorphEyesError, UsageError
-from morpheyes_daemon.experiments import campaign as campaigns
-from morpheyes_daemon.experiments import plan as plans
-from morpheyes_daemon.experiments.campaign import (
+from morpheyes_daemon.campaigns import runner as campaigns
+from morpheyes_daemon.campaigns.forest_table import Row
+from morpheyes_daemon.campaigns.results import RESULTS, SETTINGS, TABLE, Results
+from morpheyes_daemon.campaigns.results_page import write_page
+from morpheyes_daemon.campaigns.runner import (
     FLIGHTS,
     Campaign,
     parse_baselines,
@@ -22,11 +22,11 @@ from morpheyes_daemon.experiments.campaign import (
     require_jobs,
     run_campaign,
 )
-from morpheyes_daemon.experiments.campaign_results import RESULTS, SETTINGS, TABLE, Results
+from morpheyes_daemon.cli import main
+from morpheyes_daemon.errors import InputError, MorphEyesError, UsageError
+from morpheyes_daemon.experiments import plan as plans
 from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.flight_table import Row
 from morpheyes_daemon.experiments.plan import make_plan
-from morpheyes_daemon.experiments.results_page import write_page
 
 WRITTEN = (SETTINGS, RESULTS, TABLE)
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
+from morpheyes_daemon.campaigns.forest_table import Row
+from morpheyes_daemon.campaigns.runner import FLIGHTS, Campaign, run_campaign
 from morpheyes_daemon.errors import MorphEyesError
-from morpheyes_daemon.experiments.campaign import FLIGHTS, Campaign, run_campaign
-from morpheyes_daemon.experiments.flight_table import Row
 from morpheyes_daemon.experiments.plan import make_plan
 
 dask = pytest.importorskip("dask", reason="a scheduler needs the extra `campaign`")
@@ -50,7 +50,7 @@ def run(campaign: Campaign, folder: Path, cluster: Any, fly_one: Callable[..., R
     """Run a campaign whose flights are `fly_one` in the worker, where it is sent by its value."""
 
     def in_the_worker() -> None:
-        from morpheyes_daemon.experiments import campaign
+        from morpheyes_daemon.campaigns import runner as campaign
 
         campaign.fly_one = fly_one
 

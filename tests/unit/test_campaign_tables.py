@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from morpheyes_daemon.experiments.campaign_results import results_of
-from morpheyes_daemon.experiments.flight_table import Row, flight_cells, flight_table, wilson
+from morpheyes_daemon.campaigns.forest_table import Row, flight_cells, flight_table, wilson
+from morpheyes_daemon.campaigns.results import results_of
 from morpheyes_daemon.experiments.plan import make_plan
 
 FLOWN = {

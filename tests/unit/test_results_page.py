@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from morpheyes_daemon.campaigns.results_page import BEGIN, END, write_page
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.experiments.results_page import BEGIN, END, write_page
 
 SETTINGS = {
     "mission": "forest", "strategy": "forest", "world": "forest", "image_size": "320x240", "rate_hz": 1.0,

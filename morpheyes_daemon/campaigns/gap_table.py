@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.experiments.flight_table import Row, cause_lines, causes, shown_rate, success
+from morpheyes_daemon.campaigns.forest_table import Row, cause_lines, causes, shown_rate, success
 
 
 def gap_cells(rows: Sequence[Row], to_refuse: bool = False) -> list[Row]:

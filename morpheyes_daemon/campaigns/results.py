@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from morpheyes_daemon.campaigns.forest_table import Row, flight_cells, flight_table
+from morpheyes_daemon.campaigns.gap_table import gap_cells, gap_table
+from morpheyes_daemon.campaigns.imo_table import draw_trajectories, imo_cells, imo_table
 from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.flight_table import Row, flight_cells, flight_table
-from morpheyes_daemon.experiments.gap_table import gap_cells, gap_table
-from morpheyes_daemon.experiments.imo_table import draw_trajectories, imo_cells, imo_table
 from morpheyes_daemon.simulation.forest import ForestWorld
 from morpheyes_daemon.simulation.gap import GapWorld
 from morpheyes_daemon.simulation.worlds import MixedWorld, load_world
@@ -66,7 +66,7 @@ def results_of(plan: FlightPlan, rows: list[Row]) -> Results:
 def draw_figures(plan: FlightPlan, rows: Sequence[Row], folder: Path) -> None:
     """Draw into `folder` the figures that the field of a campaign shows beside its table, if any."""
     if plan.mission.strategy == "gap":
-        from morpheyes_daemon.experiments.gap_figure import draw_sequences
+        from morpheyes_daemon.campaigns.gap_figure import draw_sequences
 
         draw_sequences(folder / "sequences.png", plan, rows)
     if plan.mission.strategy == "imo":

@@ -11,8 +11,8 @@ from morpheyes_daemon.experiments.flight import FlightPlan
 from morpheyes_daemon.experiments.stage import Stage
 
 MEASURES = {
-    "gap": "morpheyes_daemon.experiments.gap_measures:GapMeasures",
-    "imo": "morpheyes_daemon.experiments.imo_measures:ImoMeasures",
+    "gap": "morpheyes_daemon.campaigns.gap_metrics:GapMeasures",
+    "imo": "morpheyes_daemon.campaigns.imo_metrics:ImoMeasures",
 }
 """Strategy to the class that looks on."""
 

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from morpheyes_daemon.campaigns.forest_table import Row
+from morpheyes_daemon.campaigns.results import SETTINGS, TABLE
 from morpheyes_daemon.config import StereoConfig
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.experiments.campaign_results import SETTINGS, TABLE
-from morpheyes_daemon.experiments.flight_table import Row
 from morpheyes_daemon.experiments.plan import DISPARITIES_OF_PX, usual_calibration
 from morpheyes_daemon.experiments.stage import WIND_M_S
 

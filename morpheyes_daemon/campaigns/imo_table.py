@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.experiments.flight_table import Row, cause_lines, causes, wilson
-from morpheyes_daemon.experiments.imo_measures import Sample, percentile, range_bins
+from morpheyes_daemon.campaigns.forest_table import Row, cause_lines, causes, wilson
+from morpheyes_daemon.campaigns.imo_metrics import Sample, percentile, range_bins
 
 SPANS_M = ((0.0, 10.0), (10.0, 16.0))
 """Ranges that the table sums up: near and far."""
