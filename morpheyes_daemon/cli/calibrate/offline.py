@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from morpheyes_daemon.cli.calibrate_live import (
+from morpheyes_daemon.cli.calibrate.live import (
     BoardOption,
     JsonOption,
     MarkerOption,
@@ -20,7 +20,7 @@ from morpheyes_daemon.cli.calibrate_live import (
     check,
     repeatability,
 )
-from morpheyes_daemon.cli.calibrate_mount import mount
+from morpheyes_daemon.cli.calibrate.mount import mount
 
 if TYPE_CHECKING:
     from morpheyes_daemon.calibration.solver.result import Solved

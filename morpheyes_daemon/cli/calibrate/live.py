@@ -53,7 +53,7 @@ def capture(
     from morpheyes_daemon.calibration.solver.mount import MOUNT_VIEWS
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file
     from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
-    from morpheyes_daemon.cli.calibrate import choose_baselines_m, choose_board
+    from morpheyes_daemon.cli.calibrate.offline import choose_baselines_m, choose_board
     from morpheyes_daemon.clock import running_clock
     from morpheyes_daemon.devices.link import open_link
     from morpheyes_daemon.shipped import load_config
@@ -134,7 +134,7 @@ def repeatability(
     from morpheyes_daemon.calibration.solver.repeatability import draw, figures, positions
     from morpheyes_daemon.calibration.targets.detection import observe
     from morpheyes_daemon.calibration.targets.image_pairs import read_folder
-    from morpheyes_daemon.cli.calibrate import choose_board
+    from morpheyes_daemon.cli.calibrate.offline import choose_board
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.stereo.rig import RigModel
 
