@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, S
-from morpheyes_daemon.config import MissionFile, NoServoConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig, VehicleConfig
 from morpheyes_daemon.control.baseline import BaselineModel, FixedBaseline
 from morpheyes_daemon.control.baseline_planner import BaselinePlanner
 from morpheyes_daemon.control.flight_control import FlightControl

@@ -16,7 +16,8 @@ from morpheyes_daemon.calibration.drift import Drift, DriftLimits, DriftMonitor
 from morpheyes_daemon.calibration.ego_motion import EyeMotion, eye_motion
 from morpheyes_daemon.calibration.scale_watch import ScaleWatch, Sight
 from morpheyes_daemon.clock import stopwatch_s
-from morpheyes_daemon.config import MissionFile, VehicleConfig
+from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
+from morpheyes_daemon.config.yaml_errors import validate
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.messages import (
     DepthMap,
@@ -37,7 +38,6 @@ from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import Craft, Strategy, View
 from morpheyes_daemon.strategies.registry import find_strategy
 from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rpy, pose
-from morpheyes_daemon.yaml_source import validate
 
 _REASONS = {ImageFault.MISALIGNED: Reason.CALIBRATION_DRIFT, ImageFault.APART: Reason.EYES_APART}
 """What is no fault of the images but of the rig."""

@@ -16,7 +16,7 @@ from morpheyes_daemon import __version__
 from morpheyes_daemon.app import Daemon, Parts
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, running_clock, wall_time_s
-from morpheyes_daemon.config import MissionFile, VehicleConfig
+from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.dashboard.server import Dashboard
 from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
 from morpheyes_daemon.devices.camera import build_camera

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import Footprint
+from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.messages import DepthSummary
 from morpheyes_daemon.strategies.base import Craft
 from morpheyes_daemon.strategies.profile import ObstacleProfile

@@ -19,7 +19,7 @@ from morpheyes_daemon.calibration.ego_motion import EyeMotion, eye_motion
 from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.calibration.yaw_watch import STILL, Uncertain
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import Mount, ServoMotion
+from morpheyes_daemon.config.vehicle import Mount, ServoMotion
 from morpheyes_daemon.messages import BaselineEstimate, StereoFrame, VehicleState
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.renderer import Renderer

@@ -12,7 +12,7 @@ from typing import Any
 
 from morpheyes_daemon.campaigns.forest_table import Row
 from morpheyes_daemon.campaigns.results import SETTINGS, TABLE
-from morpheyes_daemon.config import StereoConfig
+from morpheyes_daemon.config.vehicle import StereoConfig
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.experiments.plan import DISPARITIES_OF_PX, usual_calibration
 from morpheyes_daemon.experiments.stage import WIND_M_S

@@ -19,8 +19,8 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Check configuration and mission files; errors name file, line, key, what was found and what is allowed."""
+    from morpheyes_daemon.config.packaged import find_mission, load_config, load_mission, mission_names, shipped
     from morpheyes_daemon.errors import ConfigError
-    from morpheyes_daemon.shipped import find_mission, load_config, load_mission, mission_names, shipped
 
     if not files:
         own = Path("config.yaml")
@@ -51,8 +51,8 @@ def show(
     """Show a file with every default filled in, or with --keys what each key may be."""
     import yaml
 
-    from morpheyes_daemon.config import VehicleConfig
-    from morpheyes_daemon.shipped import load_config, load_mission
+    from morpheyes_daemon.config.packaged import load_config, load_mission
+    from morpheyes_daemon.config.vehicle import VehicleConfig
     from morpheyes_daemon.strategies.registry import find_strategy
 
     if file is not None and _is_mission(file):
@@ -74,7 +74,7 @@ def _is_mission(file: Path) -> bool:
     """A mission file names its strategy; everything else is taken for a vehicle configuration."""
     import yaml
 
-    from morpheyes_daemon.yaml_source import parse_yaml, read_text
+    from morpheyes_daemon.config.yaml_errors import parse_yaml, read_text
 
     if not file.suffix:
         return not file.is_file()

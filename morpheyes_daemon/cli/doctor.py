@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.config import VehicleConfig
+    from morpheyes_daemon.config.vehicle import VehicleConfig
     from morpheyes_daemon.doctor.examination import Examination
 
 
@@ -33,8 +33,8 @@ def command(
     """
     import asyncio
 
+    from morpheyes_daemon.config.packaged import load_config
     from morpheyes_daemon.doctor.findings import Verdict, verdict
-    from morpheyes_daemon.shipped import load_config
 
     vehicle = _with_link(load_config(config), autopilot)
     report = asyncio.run(_examine(vehicle, takeover_test, lambda text: typer.echo(text, err=True)))

@@ -23,8 +23,8 @@ def command(
     """
     import asyncio
 
+    from morpheyes_daemon.config.packaged import find_mission, load_config, load_mission
     from morpheyes_daemon.service import calibration_file, real_time_runner, serve
-    from morpheyes_daemon.shipped import find_mission, load_config, load_mission
 
     vehicle = load_config(config)
     if calibration is not None:

@@ -13,7 +13,7 @@ from bisect import bisect_right
 from dataclasses import dataclass, replace
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.config import NoServoConfig, ServoConfig, ServoMotion
+from morpheyes_daemon.config.vehicle import NoServoConfig, ServoConfig, ServoMotion
 from morpheyes_daemon.messages import BaselineEstimate
 
 SPEED_TOLERANCE = 0.08

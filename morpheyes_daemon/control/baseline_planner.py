@@ -14,7 +14,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import ServoMotion
+from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.control.baseline import SPEED_TOLERANCE
 from morpheyes_daemon.messages import BaselineEstimate
 

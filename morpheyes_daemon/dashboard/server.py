@@ -19,7 +19,7 @@ from aiohttp import WSCloseCode, web
 
 from morpheyes_daemon.bus import EventLog, Latest, Topics
 from morpheyes_daemon.clock import Clock, S, Ticker
-from morpheyes_daemon.config import DashboardConfig
+from morpheyes_daemon.config.vehicle import DashboardConfig
 from morpheyes_daemon.dashboard.snapshot import STRIPS, event_row, snapshot, strip_row
 from morpheyes_daemon.errors import DeviceNotFoundError
 from morpheyes_daemon.messages import Event, Image, Perception

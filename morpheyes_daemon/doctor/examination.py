@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import Clock
-from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.devices.camera import build_camera
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.devices.servo import build_servo

@@ -10,7 +10,7 @@ import shutil
 from pathlib import Path
 
 from morpheyes_daemon.clock import wall_time_s
-from morpheyes_daemon.config import SerialServoConfig, V4l2CameraConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import SerialServoConfig, V4l2CameraConfig, VehicleConfig
 from morpheyes_daemon.doctor.findings import Finding, Severity
 
 WARM_C, HOT_C = 75.0, 83.0

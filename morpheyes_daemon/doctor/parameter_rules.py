@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.control import parameters as p
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.doctor.evidence import (

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.devices.camera import Camera
 from morpheyes_daemon.devices.servo import Servo
 from morpheyes_daemon.doctor.findings import Finding, Severity

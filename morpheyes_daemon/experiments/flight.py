@@ -18,7 +18,13 @@ from typing import Any, Protocol
 from morpheyes_daemon.app import Daemon, Parts
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, run_virtual, running_clock, stopwatch_s
-from morpheyes_daemon.config import AutopilotConfig, MissionFile, SerialServoConfig, SimCameraConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import (
+    AutopilotConfig,
+    MissionFile,
+    SerialServoConfig,
+    SimCameraConfig,
+    VehicleConfig,
+)
 from morpheyes_daemon.devices.link import Link, LinkOpener, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceNotFoundError

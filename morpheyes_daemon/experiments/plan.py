@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from morpheyes_daemon.calibration.targets.observations import Progress, silent
-from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.config.packaged import find_mission, load_config, load_mission
+from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.experiments.flight import FlightPlan, sim_config
 from morpheyes_daemon.experiments.stage import Scenario
 from morpheyes_daemon.perception import fitting_rig
-from morpheyes_daemon.shipped import find_mission, load_config, load_mission
 from morpheyes_daemon.simulation.worlds import load_world
 
 DISPARITIES_OF_PX = 640

@@ -20,7 +20,7 @@ from typing import Any
 from morpheyes_daemon.app import Daemon
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, running_clock, stopwatch_s, wall_time_s
-from morpheyes_daemon.config import AutopilotConfig, SerialServoConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import AutopilotConfig, SerialServoConfig, VehicleConfig
 from morpheyes_daemon.errors import DeviceLostError, DeviceTimeoutError
 from morpheyes_daemon.experiments.flight import FlightPlan, Progress, Summary, Tally, summarize_flight
 from morpheyes_daemon.experiments.flight_outputs import FILES

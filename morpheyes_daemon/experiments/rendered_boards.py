@@ -20,7 +20,7 @@ from morpheyes_daemon.calibration.solver.mount import ATTITUDES, COLUMNS, MOUNT_
 from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners
 from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
 from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
-from morpheyes_daemon.config import ServoMotion
+from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages import RawPair
 from morpheyes_daemon.simulation.board_twin import BoardTwin

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import MissionFile, VehicleConfig
+from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages import MissionCommand, Perception
 from morpheyes_daemon.perception import build_strategy

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from morpheyes_daemon.clock import Clock
-from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.experiments.stage import Scenario, Stage
 from morpheyes_daemon.messages import RawPair, frozen
 

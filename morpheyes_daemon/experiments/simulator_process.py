@@ -19,7 +19,7 @@ from typing import Any
 
 from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.clock import MS, Clock, S, running_clock
-from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.errors import MorphEyesError
 from morpheyes_daemon.experiments.flight import Crew, Progress, conduct, make_crew
 from morpheyes_daemon.experiments.flight_outputs import scene_of

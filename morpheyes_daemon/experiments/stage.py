@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from morpheyes_daemon.clock import MS, Clock, S
-from morpheyes_daemon.config import NoServoConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import NoServoConfig, VehicleConfig
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.messages import RawPair
 from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, RECOMMENDED

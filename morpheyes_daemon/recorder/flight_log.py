@@ -15,7 +15,7 @@ from typing import IO, Any, cast
 from mcap.writer import CompressionType, Writer
 
 from morpheyes_daemon import __version__
-from morpheyes_daemon.config import MissionFile, VehicleConfig
+from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.recorder.channels import Entry
 from morpheyes_daemon.recorder.spool import Spool
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morpheyes_daemon.config import Footprint, VehicleConfig
+from morpheyes_daemon.config.vehicle import Footprint, VehicleConfig
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import draw_map
 from morpheyes_daemon.recorder.pictures.scene import Scene

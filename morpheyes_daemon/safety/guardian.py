@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.messages import VehicleState
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.concerns import concern

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import Mount
+from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.messages import FloatMap, Image, Pinhole, RawPair
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.renderer import Rendered, Renderer

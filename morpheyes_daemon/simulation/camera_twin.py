@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from morpheyes_daemon.config import Mount
+from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.messages import FloatMap, Image, Pinhole, RawPair, frozen
 from morpheyes_daemon.simulation.develop import NOISE, develop
 from morpheyes_daemon.simulation.renderer import Rendered, Renderer

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from morpheyes_daemon.config import Section
+from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.simulation import meshes, textures
 from morpheyes_daemon.simulation.contents import START_ROOM_M, Contents
 from morpheyes_daemon.simulation.ground import Ground, Relief, lay

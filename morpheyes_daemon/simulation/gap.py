@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import Field, model_validator
 
-from morpheyes_daemon.config import Section
+from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.simulation import meshes
 from morpheyes_daemon.simulation.collision import MovingObstacles, Obstacles, box_solid
 from morpheyes_daemon.simulation.contents import Contents, GapTruth, lit

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from morpheyes_daemon.config import Section
+from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.transforms import Array
 
 WAVES = 3

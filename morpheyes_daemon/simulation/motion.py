@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from morpheyes_daemon.config import Section
+from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.transforms import Array, R_from_rpy, pose
 
 PoseAt = Callable[[float], Array]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.config import Mount
+from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import R_FRD_CAM, Array, R_from_rotvec, R_from_rpy, inverse, pose

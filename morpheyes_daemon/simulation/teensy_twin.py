@@ -17,7 +17,7 @@ from enum import Enum
 import numpy as np
 
 from morpheyes_daemon.clock import MS, Clock, S, Ticker
-from morpheyes_daemon.config import ServoMotion
+from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.wire.servo import (
     VERSION,
     Ack,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from pydantic import Field, model_validator
 
-from morpheyes_daemon.config import Section
+from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.simulation.ground import Ground
 from morpheyes_daemon.simulation.species import BUSHES, bush
 from morpheyes_daemon.simulation.trees import Branch, Tree

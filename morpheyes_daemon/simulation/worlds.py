@@ -15,7 +15,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from morpheyes_daemon.config import Section
+from morpheyes_daemon.config.vehicle import Section
+from morpheyes_daemon.config.yaml_errors import load_model
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.simulation import meshes, textures
 from morpheyes_daemon.simulation.collision import CollisionWorld, VehicleShape
@@ -27,7 +28,6 @@ from morpheyes_daemon.simulation.looks import materials_of, textures_of
 from morpheyes_daemon.simulation.room import Cube, RoomWorld, cube_contents, room_contents, room_light
 from morpheyes_daemon.simulation.scene import SKY_OBJECT, Bgr, Light, Mesh, Scene
 from morpheyes_daemon.transforms import Array
-from morpheyes_daemon.yaml_source import load_model
 
 FOLDER = Path(__file__).parent / "worlds"
 

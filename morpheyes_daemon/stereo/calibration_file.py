@@ -17,10 +17,10 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
+from morpheyes_daemon.config.yaml_errors import parse_yaml, read_text, validate
 from morpheyes_daemon.errors import CalibrationError, ConfigError
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, EyeMount, RigModel
-from morpheyes_daemon.yaml_source import parse_yaml, read_text, validate
 
 FORMAT = "morpheyes-calibration-1"
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.config import StereoConfig
+from morpheyes_daemon.config.vehicle import StereoConfig
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages import DepthMap, FloatMap, Image, StereoFrame, frozen
 from morpheyes_daemon.stereo.matching import Match, MatchSettings, disparity_range, match

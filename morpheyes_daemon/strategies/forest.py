@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import Section
+from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.control.baseline import baseline_for
 from morpheyes_daemon.control.pid import Pid, PidGains
 from morpheyes_daemon.messages import Intent, MissionCommand, VehicleState

@@ -9,10 +9,10 @@ from pathlib import Path
 import yaml
 from pydantic import BaseModel, create_model
 
-from morpheyes_daemon.config import MissionFile
+from morpheyes_daemon.config.vehicle import MissionFile
+from morpheyes_daemon.config.yaml_errors import line_of, read_text, validate
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.strategies.base import Strategy, StrategyParameters
-from morpheyes_daemon.yaml_source import line_of, read_text, validate
 
 BUILT_IN = {
     "forest": "morpheyes_daemon.strategies.forest:Forest",

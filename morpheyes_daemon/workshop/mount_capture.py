@@ -20,7 +20,7 @@ from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.calibration.solver.mount import ATTITUDES, COLUMNS, attitude_rows
 from morpheyes_daemon.calibration.targets.boards import Board, find_corners
 from morpheyes_daemon.clock import Clock, S
-from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError

@@ -10,7 +10,7 @@ from typing import Self
 
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import MS, Clock
-from morpheyes_daemon.config import NoServoConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import NoServoConfig, VehicleConfig
 from morpheyes_daemon.control.baseline import BaselineModel, FixedBaseline
 from morpheyes_daemon.control.baseline_planner import OVERSHOOT_M
 from morpheyes_daemon.devices.camera import Camera, build_camera

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.clock import MS, MonotonicClock, S, run_virtual, running_clock
-from morpheyes_daemon.config import RecordingCameraConfig, SimCameraConfig, V4l2CameraConfig
+from morpheyes_daemon.config.vehicle import RecordingCameraConfig, SimCameraConfig, V4l2CameraConfig
 from morpheyes_daemon.devices.camera import build_camera
 from morpheyes_daemon.devices.camera.recording import RecordingCamera
 from morpheyes_daemon.devices.camera.simulator import SimulatorCamera

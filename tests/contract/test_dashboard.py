@@ -14,7 +14,7 @@ from aiohttp.test_utils import TestClient, TestServer, unused_port
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import MonotonicClock, S
-from morpheyes_daemon.config import DashboardConfig
+from morpheyes_daemon.config.vehicle import DashboardConfig
 from morpheyes_daemon.dashboard import server
 from morpheyes_daemon.dashboard.server import CLIENTS, PAGES, Dashboard
 from morpheyes_daemon.dashboard.snapshot import STRIPS

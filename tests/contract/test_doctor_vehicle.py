@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from morpheyes_daemon.clock import run_virtual
-from morpheyes_daemon.config import AutopilotConfig, NoServoConfig, SimCameraConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import AutopilotConfig, NoServoConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.devices.autopilot.parameters import parameter_file
 from morpheyes_daemon.doctor.findings import Finding, Severity, Verdict, remedies, verdict
 from morpheyes_daemon.doctor.takeover import HandOver, TakeoverTest

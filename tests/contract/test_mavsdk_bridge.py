@@ -12,7 +12,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import run_virtual
-from morpheyes_daemon.config import AutopilotConfig
+from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
 from morpheyes_daemon.wire.mavlink import Encoder, Identity
 from tests.hub_bench import HubBench

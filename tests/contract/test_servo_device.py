@@ -12,7 +12,7 @@ import pytest
 
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import S, run_virtual, running_clock
-from morpheyes_daemon.config import NoServoConfig, ServoMotion
+from morpheyes_daemon.config.vehicle import NoServoConfig, ServoMotion
 from morpheyes_daemon.devices.link import Link, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.devices.servo.serial import SerialServo

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from morpheyes_daemon.config import SerialServoConfig
+from morpheyes_daemon.config.vehicle import SerialServoConfig
 from morpheyes_daemon.supervisor.sd_notify import notify
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"

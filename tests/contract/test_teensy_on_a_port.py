@@ -9,7 +9,7 @@ import pytest
 
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import MonotonicClock
-from morpheyes_daemon.config import ServoMotion
+from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.devices.link import open_link
 from morpheyes_daemon.devices.servo.serial import SerialServo
 from morpheyes_daemon.messages import Event

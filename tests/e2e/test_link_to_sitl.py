@@ -16,7 +16,7 @@ import pytest
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, Ticker, running_clock
-from morpheyes_daemon.config import AutopilotConfig
+from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
 from morpheyes_daemon.devices.link import open_link

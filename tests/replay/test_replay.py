@@ -12,7 +12,7 @@ import pytest
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.cli import main
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import MissionFile, SimCameraConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import MissionFile, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.experiments.replay import replay
 from morpheyes_daemon.messages import DepthSummary, FloatMap, Intent, MissionCommand, Perception, VehicleState

@@ -9,7 +9,7 @@ from typing import cast
 import pytest
 
 from morpheyes_daemon.clock import S, run_virtual, running_clock
-from morpheyes_daemon.config import MissionFile, NoServoConfig
+from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig
 from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.safety.guardian import Guardian
 from morpheyes_daemon.safety.states import HOLDING, State

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from morpheyes_daemon.clock import MS, VirtualLoop, run_virtual
-from morpheyes_daemon.config import NoServoConfig
+from morpheyes_daemon.config.vehicle import NoServoConfig
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.tasks.health import LISTEN_HZ

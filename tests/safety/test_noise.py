@@ -7,7 +7,7 @@ import random
 import pytest
 
 from morpheyes_daemon.clock import run_virtual
-from morpheyes_daemon.config import NoServoConfig, SerialServoConfig, ServoConfig
+from morpheyes_daemon.config.vehicle import NoServoConfig, SerialServoConfig, ServoConfig
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.states import State
 from tests.noisy_daemon import (

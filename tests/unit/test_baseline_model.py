@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.config import NoServoConfig, SerialServoConfig, ServoMotion
+from morpheyes_daemon.config.vehicle import NoServoConfig, SerialServoConfig, ServoMotion
 from morpheyes_daemon.control.baseline import HISTORY_NS, BaselineModel, FixedBaseline, baseline_for, baseline_model
 from morpheyes_daemon.simulation.teensy_twin import ServoFault, ServoTruth, TeensyTwin
 from morpheyes_daemon.wire.servo import SetTarget, encode

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.config import ServoMotion
+from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.control.baseline import SPEED_TOLERANCE, BaselineModel
 from morpheyes_daemon.control.baseline_planner import TURN_SIGMA_M, WINDOW_NS, BaselinePlanner
 from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin

@@ -10,7 +10,7 @@ import pytest
 
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import S, run_virtual, running_clock
-from morpheyes_daemon.config import ServoMotion
+from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.control.baseline import BaselineModel
 from morpheyes_daemon.control.baseline_planner import BaselinePlanner
 from morpheyes_daemon.errors import DeviceError

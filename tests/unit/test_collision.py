@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from morpheyes_daemon.config import Footprint, Mount
+from morpheyes_daemon.config.vehicle import Footprint, Mount
 from morpheyes_daemon.simulation.collision import (
     CollisionWorld,
     MovingObstacles,

@@ -9,11 +9,11 @@ import pytest
 from pydantic import BaseModel
 
 import morpheyes_daemon
-from morpheyes_daemon.config import VehicleConfig
+from morpheyes_daemon.config.packaged import load_config, load_mission, mission_names, shipped
+from morpheyes_daemon.config.vehicle import VehicleConfig
+from morpheyes_daemon.config.yaml_errors import parse_model
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.reasons import Reason
-from morpheyes_daemon.shipped import load_config, load_mission, mission_names, shipped
-from morpheyes_daemon.yaml_source import parse_model
 
 GOOD = "camera: {backend: v4l2}\nservo: {backend: serial}\n"
 

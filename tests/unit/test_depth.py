@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.config import StereoConfig
+from morpheyes_daemon.config.vehicle import StereoConfig
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.messages import BaselineEstimate, StereoFrame
 from morpheyes_daemon.stereo.depth import (

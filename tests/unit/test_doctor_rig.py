@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import (
+from morpheyes_daemon.config.vehicle import (
     NoServoConfig,
     RecorderConfig,
     RecordingCameraConfig,

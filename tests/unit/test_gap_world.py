@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from morpheyes_daemon.config import Footprint, Mount
+from morpheyes_daemon.config.vehicle import Footprint, Mount
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.experiments.flight_outputs import wall_plan
 from morpheyes_daemon.messages import Pinhole
@@ -146,7 +146,7 @@ def test_waypoints_are_passed_smoothly() -> None:
 
 
 def test_waypoints_out_of_order_are_refused() -> None:
-    from morpheyes_daemon.yaml_source import parse_model
+    from morpheyes_daemon.config.yaml_errors import parse_model
 
     text = "world:\n  kind: room\n  cube:\n    waypoints: [[0, 1, 0, 1], [0, 2, 0, 1]]\n"
     with pytest.raises(ConfigError, match="times of the waypoints"):

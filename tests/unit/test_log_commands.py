@@ -8,7 +8,7 @@ import pytest
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.cli import main
-from morpheyes_daemon.config import MissionFile, NoServoConfig, SimCameraConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.pictures.scene import Scene
 from morpheyes_daemon.recorder.recorder import Recorder

@@ -11,7 +11,7 @@ import pytest
 
 from morpheyes_daemon.calibration.solver.mount import ATTITUDES, MountViews, read_mount_folder, solve_mount, ways_up
 from morpheyes_daemon.calibration.targets.boards import Board
-from morpheyes_daemon.config import Mount
+from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.experiments.rendered_boards import render_mount_folder
 from morpheyes_daemon.simulation.rig_twin import RANGE_M, RigTwin, T_frd_rig

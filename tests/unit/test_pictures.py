@@ -9,7 +9,7 @@ import pytest
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.config import Footprint
+from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.messages import BaselineEstimate, VehicleState
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.recorder.pictures.film import FlightFilm

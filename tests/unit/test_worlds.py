@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from morpheyes_daemon.config.yaml_errors import parse_model
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.simulation.collision import VehicleShape
 from morpheyes_daemon.simulation.forest import ForestWorld, plant
 from morpheyes_daemon.simulation.scene import Light
 from morpheyes_daemon.simulation.trees import Tree
 from morpheyes_daemon.simulation.worlds import Daylight, WorldFile, build_world, load_world, world_names
-from morpheyes_daemon.yaml_source import parse_model
 
 CONTROL_RADIUS_M = 0.17
 """Footprint of the straight-line control run."""

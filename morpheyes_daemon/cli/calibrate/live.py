@@ -12,7 +12,7 @@ import typer
 
 if TYPE_CHECKING:
     from morpheyes_daemon.calibration.checks import CheckResult, RigCheck
-    from morpheyes_daemon.config import VehicleConfig
+    from morpheyes_daemon.config.vehicle import VehicleConfig
     from morpheyes_daemon.messages import Image
     from morpheyes_daemon.workshop.capture import Scene
 
@@ -55,8 +55,8 @@ def capture(
     from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
     from morpheyes_daemon.cli.calibrate.offline import choose_baselines_m, choose_board
     from morpheyes_daemon.clock import running_clock
+    from morpheyes_daemon.config.packaged import load_config
     from morpheyes_daemon.devices.link import open_link
-    from morpheyes_daemon.shipped import load_config
     from morpheyes_daemon.workshop.capture import capture_boards, capture_visits
     from morpheyes_daemon.workshop.mount_capture import HandHeldVehicle, capture_mount
     from morpheyes_daemon.workshop.stand import RigStand
@@ -109,7 +109,7 @@ def check(
         if folder is not None:
             result = _check_recorded(rig, folder, baseline_mm, progress)
         else:
-            from morpheyes_daemon.shipped import load_config
+            from morpheyes_daemon.config.packaged import load_config
 
             result = _check_live(rig, load_config(config), frames, progress)
     if as_json:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import MS, Clock, S, Ticker, wall_time_s
-from morpheyes_daemon.config import AutopilotConfig
+from morpheyes_daemon.config.vehicle import AutopilotConfig
+from morpheyes_daemon.config.yaml_errors import read_text
 from morpheyes_daemon.devices.autopilot.commands import CommandClient
 from morpheyes_daemon.devices.autopilot.echo import EchoWatch
 from morpheyes_daemon.devices.autopilot.parameters import ParameterClient
@@ -37,7 +38,6 @@ from morpheyes_daemon.wire.mavlink import (
     text_of,
 )
 from morpheyes_daemon.wire.obstacle_distance import obstacle_distance_message
-from morpheyes_daemon.yaml_source import read_text
 
 WATCH_HZ = 20.0
 ONCE_A_SECOND_NS = S

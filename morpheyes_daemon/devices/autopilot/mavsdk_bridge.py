@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from morpheyes_daemon.clock import Clock
-from morpheyes_daemon.config import AutopilotConfig
+from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
 from morpheyes_daemon.errors import DeviceError
 

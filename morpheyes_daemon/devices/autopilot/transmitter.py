@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from morpheyes_daemon.config import AutopilotConfig
+from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.devices.link import Link
 from morpheyes_daemon.wire.mavlink import (
     ChannelOverride,

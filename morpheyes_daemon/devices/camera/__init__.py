@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from morpheyes_daemon.clock import Clock
-from morpheyes_daemon.config import CameraConfig, RecordingCameraConfig, V4l2CameraConfig
+from morpheyes_daemon.config.vehicle import CameraConfig, RecordingCameraConfig, V4l2CameraConfig
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.messages import RawPair
 

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.clock import Clock, Ticker
-from morpheyes_daemon.config import RecordingCameraConfig
+from morpheyes_daemon.config.vehicle import RecordingCameraConfig
 from morpheyes_daemon.errors import DeviceLostError, InputError
 from morpheyes_daemon.messages import Image, RawPair, frozen
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 
-from morpheyes_daemon.config import CameraBase
+from morpheyes_daemon.config.vehicle import CameraBase
 from morpheyes_daemon.devices.camera.newest import NewestPair
 from morpheyes_daemon.errors import DeviceLostError, DeviceNotFoundError
 from morpheyes_daemon.messages import RawPair

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.clock import MS, Clock, S
-from morpheyes_daemon.config import V4l2CameraConfig
+from morpheyes_daemon.config.vehicle import V4l2CameraConfig
 from morpheyes_daemon.devices.camera.newest import NewestPair
 from morpheyes_daemon.devices.camera.recording import halves
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFoundError, InputError

@@ -6,7 +6,7 @@ from typing import Protocol
 
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import Clock
-from morpheyes_daemon.config import NoServoConfig, ServoConfig
+from morpheyes_daemon.config.vehicle import NoServoConfig, ServoConfig
 from morpheyes_daemon.devices.link import LinkOpener
 
 

@@ -12,7 +12,7 @@ from functools import partial
 
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import MS, Clock, S
-from morpheyes_daemon.config import ServoMotion
+from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.devices.link import Link, LinkOpener
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from morpheyes_daemon.messages import Event

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.config import Footprint
+from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.recorder.pictures.outline import Track, boxes, placed
 from morpheyes_daemon.recorder.pictures.scene import Scene
 from morpheyes_daemon.stereo.colours import baseline_bgr

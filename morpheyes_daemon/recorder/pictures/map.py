@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.config import Footprint
+from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.recorder.pictures.closeups import draw_closeups
 from morpheyes_daemon.recorder.pictures.outline import Track, clearances, closest_passes
 from morpheyes_daemon.recorder.pictures.scene import Scene

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.config import Footprint
+from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.recorder.pictures.scene import Scene
 from morpheyes_daemon.recorder.series import FlightSeries
 

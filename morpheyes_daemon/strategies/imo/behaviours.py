@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from morpheyes_daemon.config import Section
+from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.transforms import Array
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from morpheyes_daemon.config import MissionFile, VehicleConfig
+from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
+from morpheyes_daemon.config.yaml_errors import load_model
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.yaml_source import load_model
 
-_PACKAGE = Path(__file__).resolve().parent
+_PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def shipped(name: str) -> Path:

@@ -1,0 +1,1 @@
+"""Configuration and mission files: pydantic models, errors that name the YAML line, packaged files."""
