@@ -16,10 +16,10 @@ from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig, VehicleConfig
 from morpheyes_daemon.control.baseline import BaselineModel, FixedBaseline
 from morpheyes_daemon.control.baseline_planner import BaselinePlanner
-from morpheyes_daemon.control.flight_control import FlightControl
 from morpheyes_daemon.control.governor import Governor, GovernorLimits
 from morpheyes_daemon.control.loiter import LoiterModel
-from morpheyes_daemon.control.vehicle_track import VehicleTrack
+from morpheyes_daemon.control.pose_history import VehicleTrack
+from morpheyes_daemon.control.stick_controller import FlightControl
 from morpheyes_daemon.control.velocity import BRAKE_LEAN_RAD, VelocityTuning
 from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
 from morpheyes_daemon.devices.camera import Camera

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, S
-from morpheyes_daemon.control.vehicle_track import VehicleTrack
+from morpheyes_daemon.control.pose_history import VehicleTrack
 from morpheyes_daemon.messages import Event, Perception
 from morpheyes_daemon.perception import VisionJob
 from morpheyes_daemon.reasons import Reason

@@ -6,8 +6,8 @@ from typing import Protocol
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import MS, Clock, Ticker
-from morpheyes_daemon.control.flight_control import FlightControl
-from morpheyes_daemon.control.vehicle_track import VehicleTrack
+from morpheyes_daemon.control.pose_history import VehicleTrack
+from morpheyes_daemon.control.stick_controller import FlightControl
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease

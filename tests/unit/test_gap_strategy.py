@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.config.vehicle import Footprint
-from morpheyes_daemon.control.line import LEAN_LAG_S, LineKeeper
+from morpheyes_daemon.control.path_following import LEAN_LAG_S, LineKeeper
 from morpheyes_daemon.messages import DepthSummary, Intent, VehicleState
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation

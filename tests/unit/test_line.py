@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morpheyes_daemon.control.line import (
+from morpheyes_daemon.control.path_following import (
     ANSWER_S,
     CLIMB_GAIN_1_S,
     CLIMB_MOST_M_S,

@@ -9,8 +9,8 @@ import math
 from dataclasses import replace
 
 from morpheyes_daemon.control.governor import Governor
-from morpheyes_daemon.control.line import LineKeeper
 from morpheyes_daemon.control.loiter import LoiterModel
+from morpheyes_daemon.control.path_following import LineKeeper
 from morpheyes_daemon.control.velocity import VelocityController, VelocityTuning, height_above_ground_m
 from morpheyes_daemon.messages import DepthSummary, Governed, MissionCommand, Sticks, VehicleState
 
