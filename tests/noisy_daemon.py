@@ -16,10 +16,10 @@ from typing import Any, Self
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.app import Daemon, Parts
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, running_clock
 from morpheyes_daemon.config.vehicle import AutopilotConfig, MissionFile, ServoConfig, SimCameraConfig, VehicleConfig
+from morpheyes_daemon.daemon.composition import Daemon, Parts
 from morpheyes_daemon.devices.link import Link, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.messages import Event, RawPair, Sticks

@@ -17,12 +17,12 @@ from statistics import median
 from typing import Any
 
 from morpheyes_daemon.clock import S, running_clock
+from morpheyes_daemon.daemon.service import real_time_runner
 from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.experiments.flight import FlightPlan, Progress
 from morpheyes_daemon.experiments.realtime import RealtimeFlight, realtime_daemon
 from morpheyes_daemon.experiments.stick_beat import StickIntervals
 from morpheyes_daemon.safety.states import State
-from morpheyes_daemon.service import real_time_runner
 
 ENGAGE_LIMIT_S = 120.0
 SAMPLE_S = 5.0

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.app import Daemon
 from morpheyes_daemon.campaigns.gap_ground_truth import filled, iou, true_masks
+from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.experiments.flight import FlightPlan
 from morpheyes_daemon.experiments.stage import Stage
 from morpheyes_daemon.messages import Perception, StereoFrame

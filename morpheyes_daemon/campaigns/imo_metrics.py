@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.app import Daemon
+from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.experiments.flight import FlightPlan
 from morpheyes_daemon.experiments.stage import Stage
 from morpheyes_daemon.messages import Perception, Pinhole, StereoFrame, Track

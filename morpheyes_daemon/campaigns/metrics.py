@@ -6,7 +6,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Protocol
 
-from morpheyes_daemon.app import Daemon
+from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.experiments.flight import FlightPlan
 from morpheyes_daemon.experiments.stage import Stage
 

@@ -24,7 +24,7 @@ def command(
     import asyncio
 
     from morpheyes_daemon.config.packaged import find_mission, load_config, load_mission
-    from morpheyes_daemon.service import calibration_file, real_time_runner, serve
+    from morpheyes_daemon.daemon.service import calibration_file, real_time_runner, serve
 
     vehicle = load_config(config)
     if calibration is not None:

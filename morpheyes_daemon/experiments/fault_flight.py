@@ -16,9 +16,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Self
 
-from morpheyes_daemon.app import Daemon, Parts
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, VirtualLoop, running_clock
+from morpheyes_daemon.daemon.composition import Daemon, Parts
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.experiments.flight import (

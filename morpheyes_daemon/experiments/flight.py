@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from morpheyes_daemon.app import Daemon, Parts
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, run_virtual, running_clock, stopwatch_s
 from morpheyes_daemon.config.vehicle import (
@@ -25,6 +24,7 @@ from morpheyes_daemon.config.vehicle import (
     SimCameraConfig,
     VehicleConfig,
 )
+from morpheyes_daemon.daemon.composition import Daemon, Parts
 from morpheyes_daemon.devices.link import Link, LinkOpener, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceNotFoundError

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from morpheyes_daemon.app import Daemon
 from morpheyes_daemon.clock import S, wall_time_s
+from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.experiments.flight import FlightPlan, Summary, Watchers
 from morpheyes_daemon.experiments.stage import Stage
 from morpheyes_daemon.messages import VehicleState

@@ -17,10 +17,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from morpheyes_daemon.app import Daemon
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, running_clock, stopwatch_s, wall_time_s
 from morpheyes_daemon.config.vehicle import AutopilotConfig, SerialServoConfig, VehicleConfig
+from morpheyes_daemon.daemon.composition import Daemon
+from morpheyes_daemon.daemon.service import build_parts, real_time_runner
 from morpheyes_daemon.errors import DeviceLostError, DeviceTimeoutError
 from morpheyes_daemon.experiments.flight import FlightPlan, Progress, Summary, Tally, summarize_flight
 from morpheyes_daemon.experiments.flight_outputs import FILES
@@ -34,7 +35,6 @@ from morpheyes_daemon.recorder.reader import read_flight
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.report import draw_report
 from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.service import build_parts, real_time_runner
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.supervisor.worker_process import ProcessWorker
 

@@ -4,9 +4,9 @@ import multiprocessing
 import threading
 from types import SimpleNamespace
 
+from morpheyes_daemon.daemon.service import real_time_runner
 from morpheyes_daemon.experiments.realtime import Simulator
 from morpheyes_daemon.experiments.simulator_process import Ready
-from morpheyes_daemon.service import real_time_runner
 
 
 def test_a_scene_larger_than_the_pipe_arrives_whole() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from morpheyes_daemon.config.vehicle import SerialServoConfig
-from morpheyes_daemon.supervisor.sd_notify import notify
+from morpheyes_daemon.daemon.sd_notify import notify
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"
 UNIT = SYSTEMD / "morpheyes.service"

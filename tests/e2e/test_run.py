@@ -19,11 +19,11 @@ from typer.testing import CliRunner
 
 from morpheyes_daemon.cli import build
 from morpheyes_daemon.clock import MonotonicClock
+from morpheyes_daemon.daemon.service import ending_by_signal
 from morpheyes_daemon.messages import Perception
 from morpheyes_daemon.recorder.reader import Flight, read_flight
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import Action
-from morpheyes_daemon.service import ending_by_signal
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.rig_twin import RigTwin
 from morpheyes_daemon.simulation.serve_mavlink import MavlinkServer

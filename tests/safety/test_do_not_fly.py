@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from morpheyes_daemon.app import ALARMS
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config.vehicle import NoServoConfig, SerialServoConfig
+from morpheyes_daemon.daemon.composition import ALARMS
 from morpheyes_daemon.doctor.findings import Severity
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.reasons import Reason

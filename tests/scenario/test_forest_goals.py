@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from morpheyes_daemon.app import Daemon
+from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.experiments.flight import FlightPlan, Watchers, fly
 from morpheyes_daemon.experiments.plan import make_plan
 from morpheyes_daemon.experiments.stage import Stage

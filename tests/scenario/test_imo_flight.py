@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morpheyes_daemon.app import Daemon
 from morpheyes_daemon.campaigns.imo_metrics import ImoMeasures
+from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.experiments.flight import Summary, Watchers, fly
 from morpheyes_daemon.experiments.plan import make_plan
 from morpheyes_daemon.experiments.stage import Stage

@@ -13,10 +13,11 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from morpheyes_daemon import __version__
-from morpheyes_daemon.app import Daemon, Parts
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, running_clock, wall_time_s
 from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
+from morpheyes_daemon.daemon.composition import Daemon, Parts
+from morpheyes_daemon.daemon.sd_notify import notify
 from morpheyes_daemon.dashboard.server import Dashboard
 from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
 from morpheyes_daemon.devices.camera import build_camera
@@ -31,7 +32,6 @@ from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.recorder.flight_log import flight_header, flight_path
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.stereo.rig import RigModel
-from morpheyes_daemon.supervisor.sd_notify import notify
 from morpheyes_daemon.supervisor.supervisor import Pulse, Task
 from morpheyes_daemon.supervisor.worker_process import ProcessWorker
 from morpheyes_daemon.tasks.health import Health
