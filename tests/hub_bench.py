@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, S, running_clock
 from morpheyes_daemon.config.vehicle import AutopilotConfig
-from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.devices.link import Link, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.errors import DeviceNotFoundError
 from morpheyes_daemon.messages import Event, VehicleState

@@ -21,7 +21,7 @@ from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.pose_history import VehicleTrack
 from morpheyes_daemon.control.stick_controller import FlightControl
 from morpheyes_daemon.control.velocity import BRAKE_LEAN_RAD, VelocityTuning
-from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.devices.camera import Camera
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.devices.servo import Servo

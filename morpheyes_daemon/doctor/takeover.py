@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from morpheyes_daemon.clock import MS, Clock, S, Ticker
 from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.control.loiter import LoiterModel, Widths
-from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages import VehicleState

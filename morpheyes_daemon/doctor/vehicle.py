@@ -12,7 +12,7 @@ from collections.abc import Callable
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config.vehicle import VehicleConfig
-from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.doctor.findings import Finding, Severity

@@ -21,7 +21,7 @@ from morpheyes_daemon.calibration.solver.mount import ATTITUDES, COLUMNS, attitu
 from morpheyes_daemon.calibration.targets.boards import Board, find_corners
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config.vehicle import VehicleConfig
-from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
 from morpheyes_daemon.messages import Image, VehicleState

@@ -18,7 +18,7 @@ from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, Ticker, running_clock
 from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.control.loiter import LoiterModel
-from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.devices.link import open_link
 from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.messages import VehicleState

@@ -16,7 +16,7 @@ from typing import Any
 
 from morpheyes_daemon.clock import Clock
 from morpheyes_daemon.config.vehicle import AutopilotConfig
-from morpheyes_daemon.devices.autopilot.hub import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.errors import DeviceError
 
 MAVSDK_COMPONENT = 191

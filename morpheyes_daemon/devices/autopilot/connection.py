@@ -18,9 +18,9 @@ from morpheyes_daemon.clock import MS, Clock, S, Ticker, wall_time_s
 from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.config.yaml_errors import read_text
 from morpheyes_daemon.devices.autopilot.commands import CommandClient
-from morpheyes_daemon.devices.autopilot.echo import EchoWatch
+from morpheyes_daemon.devices.autopilot.message_intervals import STREAMS, request_streams
+from morpheyes_daemon.devices.autopilot.override_echo import EchoWatch
 from morpheyes_daemon.devices.autopilot.parameters import ParameterClient
-from morpheyes_daemon.devices.autopilot.rates import STREAMS, request_streams
 from morpheyes_daemon.devices.autopilot.telemetry import Telemetry
 from morpheyes_daemon.devices.autopilot.transmitter import Transmitter, may_relay
 from morpheyes_daemon.devices.link import LinkOpener
