@@ -15,7 +15,7 @@ from morpheyes_daemon.clock import S, run_virtual, running_clock
 from morpheyes_daemon.config.vehicle import NoServoConfig, ServoMotion
 from morpheyes_daemon.devices.link import Link, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
-from morpheyes_daemon.devices.servo.serial import SerialServo
+from morpheyes_daemon.devices.servo.teensy import SerialServo
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.reasons import Reason

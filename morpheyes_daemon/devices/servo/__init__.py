@@ -29,6 +29,6 @@ def build_servo(config: ServoConfig, opener: LinkOpener, clock: Clock, events: E
         from morpheyes_daemon.devices.servo.none import NoServo
 
         return NoServo(config.baseline_mm / 1e3)
-    from morpheyes_daemon.devices.servo.serial import SerialServo
+    from morpheyes_daemon.devices.servo.teensy import SerialServo
 
     return SerialServo(config.url, config.motion, opener, clock, events)
