@@ -140,7 +140,7 @@ def takeover(
 
     Exit code 1 when one release came later than 50 ms after the pilot's message, or a stick was held after it.
     """
-    from morpheyes_daemon.experiments.takeover import bench_takeover
+    from morpheyes_daemon.fault_injection.takeover_latency import bench_takeover
 
     plan = _plan(size, calibration, 5.0, 5.0)
     with progress_line() as report:

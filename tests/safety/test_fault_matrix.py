@@ -11,11 +11,11 @@ from types import SimpleNamespace
 import pytest
 
 from morpheyes_daemon.errors import UsageError
-from morpheyes_daemon.experiments.fault_endings import Ending, Fault, complaints
-from morpheyes_daemon.experiments.fault_flight import Measured, Sent, TruePath
-from morpheyes_daemon.experiments.fault_report import page
-from morpheyes_daemon.experiments.fault_run import Row, choose, flights, load_rows, make_row, store_row
-from morpheyes_daemon.experiments.faults import FAULTS
+from morpheyes_daemon.fault_injection.expectations import Ending, Fault, complaints
+from morpheyes_daemon.fault_injection.harness import Measured, Sent, TruePath
+from morpheyes_daemon.fault_injection.matrix import FAULTS
+from morpheyes_daemon.fault_injection.report import page
+from morpheyes_daemon.fault_injection.runner import Row, choose, flights, load_rows, make_row, store_row
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.flight_modes import Mode

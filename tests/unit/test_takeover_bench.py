@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.experiments.takeover import tells_of_the_pilot
+from morpheyes_daemon.fault_injection.takeover_latency import tells_of_the_pilot
 from morpheyes_daemon.safety.guardian import LOITER
 
 CHANNEL = 7

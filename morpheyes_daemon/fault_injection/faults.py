@@ -15,8 +15,8 @@ from dataclasses import replace
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.experiments import sabotage
-from morpheyes_daemon.experiments.fault_flight import FaultFlight
+from morpheyes_daemon.fault_injection import injectors as sabotage
+from morpheyes_daemon.fault_injection.harness import FaultFlight
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.simulation.flight_modes import Mode

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from morpheyes_daemon.experiments import fault_acts as acts
-from morpheyes_daemon.experiments import sabotage
-from morpheyes_daemon.experiments.fault_endings import Ending, Fault
+from morpheyes_daemon.fault_injection import faults as acts
+from morpheyes_daemon.fault_injection import injectors as sabotage
+from morpheyes_daemon.fault_injection.expectations import Ending, Fault
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.flight_modes import Mode
 from morpheyes_daemon.simulation.teensy_twin import ServoFault

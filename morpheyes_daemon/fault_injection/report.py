@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from morpheyes_daemon.experiments.fault_endings import Ending, Fault
-from morpheyes_daemon.experiments.fault_run import STATES, Row
-from morpheyes_daemon.experiments.faults import FAULTS
+from morpheyes_daemon.fault_injection.expectations import Ending, Fault
+from morpheyes_daemon.fault_injection.matrix import FAULTS
+from morpheyes_daemon.fault_injection.runner import STATES, Row
 from morpheyes_daemon.safety.states import State
 
 _HEAD = (

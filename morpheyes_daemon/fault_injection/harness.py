@@ -28,9 +28,9 @@ from morpheyes_daemon.experiments.flight import (
     make_crew,
     memory_opener,
 )
-from morpheyes_daemon.experiments.sabotage import FaultyCamera, FaultyWorker, Wire, lose
 from morpheyes_daemon.experiments.shared_pictures import SharedStage
 from morpheyes_daemon.experiments.stage import Stage, StageCamera
+from morpheyes_daemon.fault_injection.injectors import FaultyCamera, FaultyWorker, Wire, lose
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.perception import PipelineFactory
 from morpheyes_daemon.reasons import Reason

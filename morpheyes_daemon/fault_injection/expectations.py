@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from morpheyes_daemon.experiments import fault_acts as acts
-from morpheyes_daemon.experiments.fault_flight import Measured, Sent
+from morpheyes_daemon.fault_injection import faults as acts
+from morpheyes_daemon.fault_injection.harness import Measured, Sent
 from morpheyes_daemon.safety.states import HOLDING, State
 
 REACTION_S = 0.25

@@ -1,0 +1,1 @@
+"""Faults x states of the state machine, each flown: injectors, expectations, matrix, report."""
