@@ -15,9 +15,9 @@ from morpheyes_daemon.benchmarks.gapflyt_baseline import STACK, flow_gap, stacke
 from morpheyes_daemon.benchmarks.vision_latency import WARM_UP, Report, Times
 from morpheyes_daemon.campaigns.gap_ground_truth import filled, iou, true_masks
 from morpheyes_daemon.clock import S, VirtualClock, VirtualLoop, processor_s, stopwatch_s
-from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.plan import with_seed
-from morpheyes_daemon.experiments.stage import Stage
+from morpheyes_daemon.flights.flight_plan import with_seed
+from morpheyes_daemon.flights.lockstep import FlightPlan
+from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages import BaselineEstimate, Image, RawPair, StereoFrame, VehicleState
 from morpheyes_daemon.perception import build_strategy
 from morpheyes_daemon.simulation.contents import GapTruth

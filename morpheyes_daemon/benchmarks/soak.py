@@ -19,9 +19,9 @@ from typing import Any
 from morpheyes_daemon.clock import S, running_clock
 from morpheyes_daemon.daemon.service import real_time_runner
 from morpheyes_daemon.errors import DeviceTimeoutError
-from morpheyes_daemon.experiments.flight import FlightPlan, Progress
-from morpheyes_daemon.experiments.realtime import RealtimeFlight, realtime_daemon
-from morpheyes_daemon.experiments.stick_beat import StickIntervals
+from morpheyes_daemon.flights.lockstep import FlightPlan, Progress
+from morpheyes_daemon.flights.realtime import RealtimeFlight, realtime_daemon
+from morpheyes_daemon.flights.stick_timing import StickIntervals
 from morpheyes_daemon.safety.states import State
 
 ENGAGE_LIMIT_S = 120.0

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.clock import S, VirtualClock, VirtualLoop, stopwatch_s
-from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.stage import Stage
+from morpheyes_daemon.flights.lockstep import FlightPlan
+from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages import BaselineEstimate, Perception, RawPair, StereoFrame, VehicleState
 from morpheyes_daemon.perception import PipelineFactory, VisionJob
 from morpheyes_daemon.stereo.depth import DepthEstimator

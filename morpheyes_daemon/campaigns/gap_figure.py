@@ -16,7 +16,7 @@ import numpy as np
 from morpheyes_daemon.campaigns.forest_table import Row
 from morpheyes_daemon.campaigns.gap_metrics import BEFORE_M, BEHIND_M
 from morpheyes_daemon.config.vehicle import Footprint, Mount
-from morpheyes_daemon.experiments.flight import FlightPlan
+from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.simulation.gap import GapWorld, gap_truth
 from morpheyes_daemon.simulation.rig_twin import T_frd_rig
 from morpheyes_daemon.simulation.worlds import load_world

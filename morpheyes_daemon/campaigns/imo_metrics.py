@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.daemon.composition import Daemon
-from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.stage import Stage
+from morpheyes_daemon.flights.lockstep import FlightPlan
+from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages import Perception, Pinhole, StereoFrame, Track
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.room import RoomWorld

@@ -7,8 +7,8 @@ from importlib import import_module
 from typing import Any, Protocol
 
 from morpheyes_daemon.daemon.composition import Daemon
-from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.stage import Stage
+from morpheyes_daemon.flights.lockstep import FlightPlan
+from morpheyes_daemon.flights.sim_vehicle import Stage
 
 MEASURES = {
     "gap": "morpheyes_daemon.campaigns.gap_metrics:GapMeasures",

@@ -14,7 +14,7 @@ from pathlib import Path
 from morpheyes_daemon.campaigns.forest_table import Row, flight_cells, flight_table
 from morpheyes_daemon.campaigns.gap_table import gap_cells, gap_table
 from morpheyes_daemon.campaigns.imo_table import draw_trajectories, imo_cells, imo_table
-from morpheyes_daemon.experiments.flight import FlightPlan
+from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.simulation.forest import ForestWorld
 from morpheyes_daemon.simulation.gap import GapWorld
 from morpheyes_daemon.simulation.worlds import MixedWorld, load_world

@@ -14,8 +14,8 @@ from morpheyes_daemon.campaigns.forest_table import Row
 from morpheyes_daemon.campaigns.results import SETTINGS, TABLE
 from morpheyes_daemon.config.vehicle import StereoConfig
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.experiments.plan import DISPARITIES_OF_PX, usual_calibration
-from morpheyes_daemon.experiments.stage import WIND_M_S
+from morpheyes_daemon.flights.flight_plan import DISPARITIES_OF_PX, usual_calibration
+from morpheyes_daemon.flights.sim_vehicle import WIND_M_S
 
 BEGIN = "<!-- missions: written by `morpheyes results` -->"
 END = "<!-- end of missions -->"

@@ -21,9 +21,9 @@ from morpheyes_daemon.campaigns.forest_table import Row
 from morpheyes_daemon.campaigns.metrics import measures_for
 from morpheyes_daemon.campaigns.results import Results, draw_figures, results_of
 from morpheyes_daemon.errors import InputError, MorphEyesError, UsageError, mistake
-from morpheyes_daemon.experiments.flight import FlightPlan, Watchers, fly
-from morpheyes_daemon.experiments.flight_outputs import FlightOutputs
-from morpheyes_daemon.experiments.plan import hold, parse_baseline, with_seed
+from morpheyes_daemon.flights.artifacts import FlightOutputs
+from morpheyes_daemon.flights.flight_plan import hold, parse_baseline, with_seed
+from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
 from morpheyes_daemon.simulation.worlds import load_world
 from morpheyes_daemon.stereo.rig import RigModel
 

@@ -13,7 +13,7 @@ from morpheyes_daemon.cli.figures import say, times_text
 from morpheyes_daemon.cli.progress import progress_line
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.experiments.flight import FlightPlan, Progress
+    from morpheyes_daemon.flights.lockstep import FlightPlan, Progress
 
 app = typer.Typer(help="Time the sticks, the depth and the renderer on this machine.", no_args_is_help=True)
 
@@ -167,7 +167,7 @@ def render(size: Size = "640x480", repeats: Repeats = 20, as_json: AsJson = Fals
 
 
 def _plan(size: str, calibration: str, rate_hz: float, minutes: float) -> FlightPlan:
-    from morpheyes_daemon.experiments.plan import make_plan
+    from morpheyes_daemon.flights.flight_plan import make_plan
 
     with progress_line() as report:
         return make_plan(

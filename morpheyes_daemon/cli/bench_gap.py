@@ -25,7 +25,7 @@ def gap(
 
     require_simulator()
     from morpheyes_daemon.benchmarks.gap_detection import bench_gap
-    from morpheyes_daemon.experiments.plan import make_plan
+    from morpheyes_daemon.flights.flight_plan import make_plan
 
     with progress_line() as report:
         plan = make_plan("gap", size=size, calibration=calibration, progress=report)

@@ -45,7 +45,7 @@ def command(
     require_simulator()
     from morpheyes_daemon.campaigns.results import RESULTS
     from morpheyes_daemon.campaigns.runner import Campaign, parse_baselines, parse_seeds, require_jobs, run_campaign
-    from morpheyes_daemon.experiments.plan import make_plan
+    from morpheyes_daemon.flights.flight_plan import make_plan
 
     modes, numbers = parse_baselines(baselines), parse_seeds(seeds)
     require_jobs(jobs)

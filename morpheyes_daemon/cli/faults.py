@@ -27,9 +27,9 @@ def command(
     """
     from morpheyes_daemon.campaigns.runner import parse_seeds
     from morpheyes_daemon.cli.progress import progress_line
-    from morpheyes_daemon.experiments.plan import make_plan
     from morpheyes_daemon.fault_injection.report import page
     from morpheyes_daemon.fault_injection.runner import Row, choose, flights, load_rows, run_matrix, store_row
+    from morpheyes_daemon.flights.flight_plan import make_plan
 
     faults, wanted = choose(only), parse_seeds(seeds)
     total = flights(faults) * len(wanted)

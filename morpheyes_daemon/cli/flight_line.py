@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.experiments.flight import Progress as FlightProgress
+    from morpheyes_daemon.flights.lockstep import Progress as FlightProgress
 
 
 class FlightLine:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.experiments.flight import FlightPlan, Summary
+    from morpheyes_daemon.flights.lockstep import FlightPlan, Summary
 
 
 def command(
@@ -56,7 +56,7 @@ def command(
     if autopilot is not None and not re.fullmatch(r"tcp:[^:/]+:\d+", autopilot):
         raise UsageError(f"--autopilot {autopilot}: write tcp:HOST:PORT, the first port of the SITL, mostly 5760.")
     require_simulator()
-    from morpheyes_daemon.experiments.plan import make_plan
+    from morpheyes_daemon.flights.flight_plan import make_plan
 
     with progress_line() as report:
         plan = make_plan(
@@ -86,8 +86,8 @@ def command(
 
 def _fly_lockstep(plan: FlightPlan, folder: Path, quiet: bool) -> Summary:
     from morpheyes_daemon.cli.flight_line import FlightLine
-    from morpheyes_daemon.experiments.flight import Watchers, fly
-    from morpheyes_daemon.experiments.flight_outputs import FlightOutputs
+    from morpheyes_daemon.flights.artifacts import FlightOutputs
+    from morpheyes_daemon.flights.lockstep import Watchers, fly
 
     outputs = FlightOutputs(folder, plan)
     watchers = Watchers()
@@ -102,7 +102,7 @@ def _fly_lockstep(plan: FlightPlan, folder: Path, quiet: bool) -> Summary:
 
 def _fly_realtime(plan: FlightPlan, folder: Path, autopilot: str | None, quiet: bool) -> Summary:
     from morpheyes_daemon.cli.flight_line import FlightLine
-    from morpheyes_daemon.experiments.realtime import fly_realtime
+    from morpheyes_daemon.flights.realtime import fly_realtime
 
     with FlightLine(quiet) as line:
         return fly_realtime(plan, folder, autopilot, line.show)

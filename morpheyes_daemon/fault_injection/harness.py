@@ -21,16 +21,16 @@ from morpheyes_daemon.clock import S, VirtualLoop, running_clock
 from morpheyes_daemon.daemon.composition import Daemon, Parts
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceTimeoutError
-from morpheyes_daemon.experiments.flight import (
+from morpheyes_daemon.fault_injection.injectors import FaultyCamera, FaultyWorker, Wire, lose
+from morpheyes_daemon.flights.lockstep import (
     AUTOPILOT_URL,
     TAKE_OFF_HEIGHT_M,
     FlightPlan,
     make_crew,
     memory_opener,
 )
-from morpheyes_daemon.experiments.shared_pictures import SharedStage
-from morpheyes_daemon.experiments.stage import Stage, StageCamera
-from morpheyes_daemon.fault_injection.injectors import FaultyCamera, FaultyWorker, Wire, lose
+from morpheyes_daemon.flights.render_cache import SharedStage
+from morpheyes_daemon.flights.sim_vehicle import Stage, StageCamera
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.perception import PipelineFactory
 from morpheyes_daemon.reasons import Reason

@@ -21,12 +21,12 @@ import cv2
 
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.errors import CalibrationError, UsageError, mistake
-from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.plan import with_seed
 from morpheyes_daemon.fault_injection.expectations import REACTION_S, RELEASE_S, Ending, Fault, complaints
 from morpheyes_daemon.fault_injection.fork import Branch, branch
 from morpheyes_daemon.fault_injection.harness import FaultFlight, Measured
 from morpheyes_daemon.fault_injection.matrix import FAULTS
+from morpheyes_daemon.flights.flight_plan import with_seed
+from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.safety.states import State
 
 STATES = (State.PREFLIGHT, State.STANDBY, State.ENGAGED, State.BRAKING, State.HOLD)

@@ -19,11 +19,11 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import S, run_virtual
-from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.plan import with_seed
 from morpheyes_daemon.fault_injection import faults as acts
 from morpheyes_daemon.fault_injection.fork import branch
 from morpheyes_daemon.fault_injection.harness import FaultFlight, Sent
+from morpheyes_daemon.flights.flight_plan import with_seed
+from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.safety.guardian import LOITER
 from morpheyes_daemon.safety.states import HOLDING, State
 from morpheyes_daemon.simulation.flight_modes import Mode

@@ -47,7 +47,7 @@ def test_overrides_are_made_in_one_place_and_sent_through_one_function() -> None
 
 
 def test_the_daemon_never_imports_the_simulator() -> None:
-    below = ("simulation/", "experiments/", "cli/")
+    below = ("simulation/", "experiments/", "cli/", "flights/", "campaigns/", "fault_injection/", "benchmarks/", "paper/")
     assert not offenders(r"morpheyes_daemon\.(simulation|experiments)", *below)
 
 

@@ -5,8 +5,8 @@ import threading
 from types import SimpleNamespace
 
 from morpheyes_daemon.daemon.service import real_time_runner
-from morpheyes_daemon.experiments.realtime import Simulator
-from morpheyes_daemon.experiments.simulator_process import Ready
+from morpheyes_daemon.flights.realtime import Simulator
+from morpheyes_daemon.flights.simulator_process import Ready
 
 
 def test_a_scene_larger_than_the_pipe_arrives_whole() -> None:

@@ -18,10 +18,10 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import S, Ticker, running_clock
-from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.plan import make_plan
-from morpheyes_daemon.experiments.realtime import RealtimeFlight, fly_realtime, realtime_daemon
-from morpheyes_daemon.experiments.simulator_process import PilotAct
+from morpheyes_daemon.flights.flight_plan import make_plan
+from morpheyes_daemon.flights.lockstep import FlightPlan
+from morpheyes_daemon.flights.realtime import RealtimeFlight, fly_realtime, realtime_daemon
+from morpheyes_daemon.flights.simulator_process import PilotAct
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import Action, State

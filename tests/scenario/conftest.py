@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.flights.flight_plan import make_plan
+from morpheyes_daemon.flights.lockstep import FlightPlan
 
 WORLD = """
 world:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from morpheyes_daemon.experiments.flight import FlightPlan, Watchers, fly
+from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import Action, State
 from morpheyes_daemon.simulation.collision import VehicleShape

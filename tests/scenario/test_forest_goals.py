@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from morpheyes_daemon.daemon.composition import Daemon
-from morpheyes_daemon.experiments.flight import FlightPlan, Watchers, fly
-from morpheyes_daemon.experiments.plan import make_plan
-from morpheyes_daemon.experiments.stage import Stage
+from morpheyes_daemon.flights.flight_plan import make_plan
+from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
+from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages import Intent, MissionCommand
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput

@@ -9,7 +9,7 @@ pytest.importorskip("numba", reason="the renderer needs the extra `sim`")
 
 from morpheyes_daemon.benchmarks.gap_detection import GapBencher, gap_view
 from morpheyes_daemon.campaigns.runner import fly_one
-from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.flights.flight_plan import make_plan
 
 FIT_M = 0.040
 

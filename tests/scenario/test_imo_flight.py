@@ -7,9 +7,9 @@ import pytest
 
 from morpheyes_daemon.campaigns.imo_metrics import ImoMeasures
 from morpheyes_daemon.daemon.composition import Daemon
-from morpheyes_daemon.experiments.flight import Summary, Watchers, fly
-from morpheyes_daemon.experiments.plan import make_plan
-from morpheyes_daemon.experiments.stage import Stage
+from morpheyes_daemon.flights.flight_plan import make_plan
+from morpheyes_daemon.flights.lockstep import Summary, Watchers, fly
+from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages import Track
 
 WORLD = """

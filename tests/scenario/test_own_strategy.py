@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from morpheyes_daemon.errors import MorphEyesError
-from morpheyes_daemon.experiments.flight import Watchers, fly
-from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.flights.flight_plan import make_plan
+from morpheyes_daemon.flights.lockstep import Watchers, fly
 from morpheyes_daemon.messages import MissionCommand
 from morpheyes_daemon.strategies import registry
 

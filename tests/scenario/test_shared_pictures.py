@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from morpheyes_daemon.clock import S, run_virtual, running_clock
-from morpheyes_daemon.experiments.plan import make_plan
-from morpheyes_daemon.experiments.shared_pictures import SharedStage
-from morpheyes_daemon.experiments.stage import Stage
+from morpheyes_daemon.flights.flight_plan import make_plan
+from morpheyes_daemon.flights.render_cache import SharedStage
+from morpheyes_daemon.flights.sim_vehicle import Stage
 
 
 def test_what_is_kept_is_what_would_be_rendered(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from morpheyes_daemon.cli import main
-from morpheyes_daemon.experiments.rendered_boards import render_folder
+from morpheyes_daemon.flights.sim_boards import render_folder
 from morpheyes_daemon.simulation.rig_twin import RigTwin
 from morpheyes_daemon.stereo.rig import RigModel
 

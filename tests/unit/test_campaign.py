@@ -24,9 +24,9 @@ from morpheyes_daemon.campaigns.runner import (
 )
 from morpheyes_daemon.cli import main
 from morpheyes_daemon.errors import InputError, MorphEyesError, UsageError
-from morpheyes_daemon.experiments import plan as plans
-from morpheyes_daemon.experiments.flight import FlightPlan
-from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.flights import flight_plan as plans
+from morpheyes_daemon.flights.flight_plan import make_plan
+from morpheyes_daemon.flights.lockstep import FlightPlan
 
 WRITTEN = (SETTINGS, RESULTS, TABLE)
 

@@ -13,7 +13,7 @@ import pytest
 from morpheyes_daemon.campaigns.forest_table import Row
 from morpheyes_daemon.campaigns.runner import FLIGHTS, Campaign, run_campaign
 from morpheyes_daemon.errors import MorphEyesError
-from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.flights.flight_plan import make_plan
 
 dask = pytest.importorskip("dask", reason="a scheduler needs the extra `campaign`")
 distributed = pytest.importorskip("distributed", reason="a scheduler needs the extra `campaign`")

@@ -10,7 +10,7 @@ import pytest
 
 from morpheyes_daemon.campaigns.forest_table import Row, flight_cells, flight_table, wilson
 from morpheyes_daemon.campaigns.results import results_of
-from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.flights.flight_plan import make_plan
 
 FLOWN = {
     "baseline_mode": "variable", "seed": 0, "outcome": "reached", "reason": "goal_reached", "mean_speed_m_s": 2.0,

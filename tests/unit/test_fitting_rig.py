@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from morpheyes_daemon.errors import CalibrationError
-from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.flights.flight_plan import make_plan
 from tests.fixed_rig import fixed_rig
 
 

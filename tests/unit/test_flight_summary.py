@@ -8,7 +8,7 @@ from typing import Any
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.cli.sim import _page
-from morpheyes_daemon.experiments.flight import Summary, Tally
+from morpheyes_daemon.flights.lockstep import Summary, Tally
 from morpheyes_daemon.messages import Event
 from morpheyes_daemon.reasons import Reason
 

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("numba", reason="the simulator's worlds need the extra `sim`")
 
 from morpheyes_daemon.campaigns.gap_figure import draw_sequences
-from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.flights.flight_plan import make_plan
 
 WAY = [[-2.0 + 0.5 * k, 0.02, -1.5, 0.0, -0.1, 0.0, 0.1] for k in range(9)]
 

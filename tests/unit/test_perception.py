@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from morpheyes_daemon.calibration.drift import DriftMonitor
-from morpheyes_daemon.experiments.plan import make_plan
+from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.messages import BaselineEstimate, StereoFrame, VehicleState
 from morpheyes_daemon.perception import Pipeline, VisionJob
 from morpheyes_daemon.reasons import Reason

@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
-from morpheyes_daemon.experiments.plan import make_plan
-from morpheyes_daemon.experiments.stage import Stage
+from morpheyes_daemon.flights.flight_plan import make_plan
+from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.sitl_vehicle import AHEAD_NS, KEPT, SitlVehicle
 from tests.hand_clock import HandClock

@@ -98,7 +98,7 @@ def render(
     from morpheyes_daemon.calibration.solver.mount import MOUNT_VIEWS
     from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
     from morpheyes_daemon.cli.progress import progress_line
-    from morpheyes_daemon.experiments.rendered_boards import (
+    from morpheyes_daemon.flights.sim_boards import (
         DEFAULT_BOARD,
         render_folder,
         render_mount_folder,

@@ -28,8 +28,8 @@ from morpheyes_daemon.daemon.composition import Daemon, Parts
 from morpheyes_daemon.devices.link import Link, LinkOpener, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceNotFoundError
-from morpheyes_daemon.experiments.judge import Judge, Outcome, Reported, Verdict
-from morpheyes_daemon.experiments.stage import Scenario, Stage, StageCamera
+from morpheyes_daemon.flights.referee import Judge, Outcome, Reported, Verdict
+from morpheyes_daemon.flights.sim_vehicle import Scenario, Stage, StageCamera
 from morpheyes_daemon.messages import Event, StereoFrame
 from morpheyes_daemon.perception import PipelineFactory
 from morpheyes_daemon.reasons import Reason

@@ -10,8 +10,8 @@ from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.config.packaged import find_mission, load_config, load_mission
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.errors import UsageError
-from morpheyes_daemon.experiments.flight import FlightPlan, sim_config
-from morpheyes_daemon.experiments.stage import Scenario
+from morpheyes_daemon.flights.lockstep import FlightPlan, sim_config
+from morpheyes_daemon.flights.sim_vehicle import Scenario
 from morpheyes_daemon.perception import fitting_rig
 from morpheyes_daemon.simulation.worlds import load_world
 
@@ -104,7 +104,7 @@ def usual_calibration(strategy: str) -> str:
 
 def calibration_file(kind: str, progress: Progress = silent) -> Path:
     """Return the calibration file to fly with: solved or mounted (made once and kept), exact, or a path."""
-    from morpheyes_daemon.experiments.solved_rig import mounted_rig_file, solved_rig_file
+    from morpheyes_daemon.flights.sim_calibration import mounted_rig_file, solved_rig_file
     from morpheyes_daemon.simulation.kept import cache_folder
 
     if kind == "solved":

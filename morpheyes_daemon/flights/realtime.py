@@ -23,11 +23,11 @@ from morpheyes_daemon.config.vehicle import AutopilotConfig, SerialServoConfig, 
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.daemon.service import build_parts, real_time_runner
 from morpheyes_daemon.errors import DeviceLostError, DeviceTimeoutError
-from morpheyes_daemon.experiments.flight import FlightPlan, Progress, Summary, Tally, summarize_flight
-from morpheyes_daemon.experiments.flight_outputs import FILES
-from morpheyes_daemon.experiments.judge import Verdict
-from morpheyes_daemon.experiments.simulator_process import End, PilotAct, Ready, SimulatorJob, simulate
-from morpheyes_daemon.experiments.stick_beat import StickBeat, StickIntervals
+from morpheyes_daemon.flights.artifacts import FILES
+from morpheyes_daemon.flights.lockstep import FlightPlan, Progress, Summary, Tally, summarize_flight
+from morpheyes_daemon.flights.referee import Verdict
+from morpheyes_daemon.flights.simulator_process import End, PilotAct, Ready, SimulatorJob, simulate
+from morpheyes_daemon.flights.stick_timing import StickBeat, StickIntervals
 from morpheyes_daemon.messages import Perception
 from morpheyes_daemon.perception import VisionJob
 from morpheyes_daemon.recorder.flight_log import flight_header

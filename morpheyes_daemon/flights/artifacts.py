@@ -10,8 +10,8 @@ import numpy as np
 
 from morpheyes_daemon.clock import S, wall_time_s
 from morpheyes_daemon.daemon.composition import Daemon
-from morpheyes_daemon.experiments.flight import FlightPlan, Summary, Watchers
-from morpheyes_daemon.experiments.stage import Stage
+from morpheyes_daemon.flights.lockstep import FlightPlan, Summary, Watchers
+from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages import VehicleState
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.pictures.film import FlightFilm

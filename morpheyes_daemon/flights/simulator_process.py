@@ -21,11 +21,11 @@ from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.clock import MS, Clock, S, running_clock
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.errors import MorphEyesError
-from morpheyes_daemon.experiments.flight import Crew, Progress, conduct, make_crew
-from morpheyes_daemon.experiments.flight_outputs import scene_of
-from morpheyes_daemon.experiments.judge import Judge
-from morpheyes_daemon.experiments.sitl import open_sitl
-from morpheyes_daemon.experiments.stage import Scenario, Stage
+from morpheyes_daemon.flights.artifacts import scene_of
+from morpheyes_daemon.flights.lockstep import Crew, Progress, conduct, make_crew
+from morpheyes_daemon.flights.referee import Judge
+from morpheyes_daemon.flights.sim_vehicle import Scenario, Stage
+from morpheyes_daemon.flights.sitl import open_sitl
 from morpheyes_daemon.messages import RawPair
 from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput

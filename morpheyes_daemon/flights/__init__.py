@@ -1,0 +1,1 @@
+"""One simulated flight: plan, lockstep or real time or SITL, referee, artifacts."""
