@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Any, Generic, TypeVar
 
-from morpheyes_daemon.messages import (
+from morpheyes_daemon.messages.core import (
     BaselineEstimate,
     Event,
     Governed,

@@ -19,7 +19,7 @@ from morpheyes_daemon.clock import stopwatch_s
 from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.config.yaml_errors import validate
 from morpheyes_daemon.errors import CalibrationError
-from morpheyes_daemon.messages import (
+from morpheyes_daemon.messages.core import (
     DepthMap,
     DepthSummary,
     Event,
@@ -30,7 +30,7 @@ from morpheyes_daemon.messages import (
     VehicleState,
     frozen,
 )
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.stereo.depth import DepthEstimator, RectifiedPair, disparity_of
 from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
 from morpheyes_daemon.stereo.image_checks import AlikeCheck, FrozenCheck, ImageFault, exposure_faults, matching_faults

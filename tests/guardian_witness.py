@@ -11,8 +11,8 @@ from collections import Counter
 from itertools import groupby
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.messages import Sticks, VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Sticks, VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput, Lease, StickLimits
 from morpheyes_daemon.safety.guardian import GuardianLimits
 from morpheyes_daemon.safety.states import Action

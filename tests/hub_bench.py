@@ -15,8 +15,8 @@ from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.devices.link import Link, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.errors import DeviceNotFoundError
-from morpheyes_daemon.messages import Event, VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event, VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.vehicle import Vehicle
 

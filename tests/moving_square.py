@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import DepthMap, Pinhole, VehicleState
+from morpheyes_daemon.messages.core import DepthMap, Pinhole, VehicleState
 from morpheyes_daemon.strategies.base import View
 from morpheyes_daemon.transforms import R_FRD_CAM, pose
 

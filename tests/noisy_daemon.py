@@ -22,7 +22,7 @@ from morpheyes_daemon.config.vehicle import AutopilotConfig, MissionFile, ServoC
 from morpheyes_daemon.daemon.composition import Daemon, Parts
 from morpheyes_daemon.devices.link import Link, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
-from morpheyes_daemon.messages import Event, RawPair, Sticks
+from morpheyes_daemon.messages.core import Event, RawPair, Sticks
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.messages import Image, Pinhole
+from morpheyes_daemon.messages.core import Image, Pinhole
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rectify import rays
 from morpheyes_daemon.stereo.rig import RigModel

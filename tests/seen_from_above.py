@@ -9,7 +9,7 @@ import numpy as np
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Footprint
-from morpheyes_daemon.messages import DepthSummary
+from morpheyes_daemon.messages.core import DepthSummary
 from morpheyes_daemon.strategies.base import Craft
 from morpheyes_daemon.strategies.profile import ObstacleProfile
 from morpheyes_daemon.transforms import R_FRD_CAM, pose

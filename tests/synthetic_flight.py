@@ -9,7 +9,7 @@ import numpy as np
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import (
+from morpheyes_daemon.messages.core import (
     BaselineEstimate,
     DepthSummary,
     Event,
@@ -20,7 +20,7 @@ from morpheyes_daemon.messages import (
     Sticks,
     VehicleState,
 )
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.recorder.pictures.scene import Disc, Scene
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import Action, State

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from morpheyes_daemon.messages import DepthMap, Pinhole
+from morpheyes_daemon.messages.core import DepthMap, Pinhole
 from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rpy, pose
 
 PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)

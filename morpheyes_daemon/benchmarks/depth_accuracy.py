@@ -17,7 +17,7 @@ import numpy as np
 from morpheyes_daemon.benchmarks.vision_latency import opencv_matcher
 from morpheyes_daemon.clock import stopwatch_s
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages import FloatMap, Image
+from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.stereo.depth import grey
 from morpheyes_daemon.stereo.image_files import read_picture
 from morpheyes_daemon.stereo.matching import SUBPIXELS, match

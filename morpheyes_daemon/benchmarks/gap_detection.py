@@ -18,7 +18,7 @@ from morpheyes_daemon.clock import S, VirtualClock, VirtualLoop, processor_s, st
 from morpheyes_daemon.flights.flight_plan import with_seed
 from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.flights.sim_vehicle import Stage
-from morpheyes_daemon.messages import BaselineEstimate, Image, RawPair, StereoFrame, VehicleState
+from morpheyes_daemon.messages.core import BaselineEstimate, Image, RawPair, StereoFrame, VehicleState
 from morpheyes_daemon.perception import build_strategy
 from morpheyes_daemon.simulation.contents import GapTruth
 from morpheyes_daemon.stereo.depth import DepthEstimator, grey

@@ -16,7 +16,7 @@ import numpy as np
 from morpheyes_daemon.benchmarks.gapflyt_baseline import dis_flow, enclosed
 from morpheyes_daemon.campaigns.gap_ground_truth import iou
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages import FloatMap, Image
+from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.stereo.depth import grey
 from morpheyes_daemon.stereo.image_files import read_picture
 from morpheyes_daemon.strategies.wall import Mask, split_inverse

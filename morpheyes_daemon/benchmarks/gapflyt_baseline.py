@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages import FloatMap, Image
+from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.strategies.wall import Mask
 
 STACK = 4

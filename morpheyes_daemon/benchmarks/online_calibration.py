@@ -20,7 +20,7 @@ from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.calibration.yaw_watch import STILL, Uncertain
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Mount, ServoMotion
-from morpheyes_daemon.messages import BaselineEstimate, StereoFrame, VehicleState
+from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame, VehicleState
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.renderer import Renderer
 from morpheyes_daemon.simulation.rig_twin import RigTwin, T_frd_rig

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.messages import Pinhole, VehicleState
+from morpheyes_daemon.messages.core import Pinhole, VehicleState
 from morpheyes_daemon.transforms import Array, R_from_rpy, pose
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates
-from morpheyes_daemon.messages import FloatMap, Image, Pinhole
+from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole
 from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.transforms import Array, inverse
 

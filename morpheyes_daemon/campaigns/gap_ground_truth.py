@@ -8,7 +8,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages import FloatMap, Pinhole
+from morpheyes_daemon.messages.core import FloatMap, Pinhole
 from morpheyes_daemon.simulation.contents import GapTruth
 from morpheyes_daemon.stereo.rectify import Rectification
 from morpheyes_daemon.strategies.wall import Mask

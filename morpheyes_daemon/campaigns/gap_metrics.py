@@ -14,7 +14,7 @@ from morpheyes_daemon.campaigns.gap_ground_truth import filled, iou, true_masks
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.flights.sim_vehicle import Stage
-from morpheyes_daemon.messages import Perception, StereoFrame
+from morpheyes_daemon.messages.core import Perception, StereoFrame
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.gap import GapWorld, drawn_shape

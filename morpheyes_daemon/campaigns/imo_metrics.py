@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.flights.sim_vehicle import Stage
-from morpheyes_daemon.messages import Perception, Pinhole, StereoFrame, Track
+from morpheyes_daemon.messages.core import Perception, Pinhole, StereoFrame, Track
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.room import RoomWorld
 from morpheyes_daemon.simulation.worlds import load_world

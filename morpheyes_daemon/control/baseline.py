@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.config.vehicle import NoServoConfig, ServoConfig, ServoMotion
-from morpheyes_daemon.messages import BaselineEstimate
+from morpheyes_daemon.messages.core import BaselineEstimate
 
 SPEED_TOLERANCE = 0.08
 """Relative; load and battery move a linear servo's speed by some percent about its data sheet's."""

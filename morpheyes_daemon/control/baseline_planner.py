@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.control.baseline import SPEED_TOLERANCE
-from morpheyes_daemon.messages import BaselineEstimate
+from morpheyes_daemon.messages.core import BaselineEstimate
 
 DEADBAND_M = 0.002
 """Smaller changes than this are never worth a motion; the only deadband towards the smallest baseline."""

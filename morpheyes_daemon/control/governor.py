@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
-from morpheyes_daemon.messages import DepthSummary, Governed, MissionCommand, VehicleState
+from morpheyes_daemon.messages.core import DepthSummary, Governed, MissionCommand, VehicleState
 from morpheyes_daemon.theory.sync import sync_speed_bound_m_s
 
 

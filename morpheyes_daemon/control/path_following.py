@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import Line, MissionCommand, VehicleState
+from morpheyes_daemon.messages.core import Line, MissionCommand, VehicleState
 
 Vector3 = tuple[float, float, float]
 

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
-from morpheyes_daemon.messages import VehicleState
+from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.transforms import wrap_rad
 
 KEEP = 400

@@ -12,7 +12,7 @@ from morpheyes_daemon.control.governor import Governor
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.path_following import LineKeeper
 from morpheyes_daemon.control.velocity import VelocityController, VelocityTuning, height_above_ground_m
-from morpheyes_daemon.messages import DepthSummary, Governed, MissionCommand, Sticks, VehicleState
+from morpheyes_daemon.messages.core import DepthSummary, Governed, MissionCommand, Sticks, VehicleState
 
 
 class FlightControl:

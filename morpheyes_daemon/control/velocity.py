@@ -13,7 +13,7 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.pid import Pid, PidGains
 from morpheyes_daemon.control.stopping import G_M_S2
-from morpheyes_daemon.messages import Sticks, VehicleState
+from morpheyes_daemon.messages.core import Sticks, VehicleState
 from morpheyes_daemon.transforms import wrap_rad
 
 Vector2 = tuple[float, float]

@@ -26,9 +26,9 @@ from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.doctor.findings import Severity
 from morpheyes_daemon.doctor.rig import examine_calibration
 from morpheyes_daemon.errors import CalibrationError
-from morpheyes_daemon.messages import Event
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.perception import PipelineFactory, fitting_rig
-from morpheyes_daemon.reasons import Reason
 from morpheyes_daemon.recorder.flight_log import flight_header, flight_path
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.stereo.rig import RigModel

@@ -22,7 +22,7 @@ from morpheyes_daemon.clock import Clock, S, Ticker
 from morpheyes_daemon.config.vehicle import DashboardConfig
 from morpheyes_daemon.dashboard.snapshot import STRIPS, event_row, snapshot, strip_row
 from morpheyes_daemon.errors import DeviceNotFoundError
-from morpheyes_daemon.messages import Event, Image, Perception
+from morpheyes_daemon.messages.core import Event, Image, Perception
 from morpheyes_daemon.stereo.colours import colour_depth
 
 PAGES = Path(__file__).parent / "pages"

@@ -11,8 +11,8 @@ from typing import Any
 
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import Event, Perception, VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event, Perception, VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 
 STRIPS = ("t_s", "z_close_m", "trust_m", "near_m", "baseline_mm", "target_mm", "speed_m_s", "limit_m_s", "wanted_m_s")
 """The columns of the live strips, in the order in which a row carries them."""

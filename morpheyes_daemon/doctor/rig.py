@@ -16,7 +16,7 @@ from morpheyes_daemon.devices.camera import Camera
 from morpheyes_daemon.devices.servo import Servo
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.errors import CalibrationError, ConfigError, DeviceError, InputError, MorphEyesError
-from morpheyes_daemon.messages import BaselineEstimate, RawPair, StereoFrame
+from morpheyes_daemon.messages.core import BaselineEstimate, RawPair, StereoFrame
 from morpheyes_daemon.stereo.depth import DepthEstimator
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.theory.sync import sync_speed_bound_m_s

@@ -17,7 +17,7 @@ from morpheyes_daemon.control.loiter import LoiterModel, Widths
 from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.errors import DeviceError
-from morpheyes_daemon.messages import VehicleState
+from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride
 
 PATIENCE_S = 60.0

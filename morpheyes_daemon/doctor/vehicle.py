@@ -18,7 +18,7 @@ from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.doctor.parameter_rules import examine_parameters
 from morpheyes_daemon.errors import DeviceError
-from morpheyes_daemon.messages import Event, VehicleState
+from morpheyes_daemon.messages.core import Event, VehicleState
 from morpheyes_daemon.safety.concerns import GPS, aided, ekf_healthy
 from morpheyes_daemon.wire.mavlink import dialect
 

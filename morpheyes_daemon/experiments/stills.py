@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages import FloatMap, Image, Pinhole
+from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole
 from morpheyes_daemon.simulation.path_traced import trace
 from morpheyes_daemon.simulation.renderer import Renderer, encode
 from morpheyes_daemon.simulation.worlds import build_world, load_world

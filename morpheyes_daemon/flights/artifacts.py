@@ -12,7 +12,7 @@ from morpheyes_daemon.clock import S, wall_time_s
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.lockstep import FlightPlan, Summary, Watchers
 from morpheyes_daemon.flights.sim_vehicle import Stage
-from morpheyes_daemon.messages import VehicleState
+from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import draw_map

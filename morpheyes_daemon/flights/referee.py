@@ -10,7 +10,7 @@ from typing import Protocol
 from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.clock import S, Ticker
 from morpheyes_daemon.flights.sim_vehicle import Stage
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.guardian import NOT_RESUMED
 from morpheyes_daemon.safety.states import State

@@ -16,7 +16,7 @@ import numpy as np
 from morpheyes_daemon.clock import Clock
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.flights.sim_vehicle import Scenario, Stage
-from morpheyes_daemon.messages import RawPair, frozen
+from morpheyes_daemon.messages.core import RawPair, frozen
 
 
 class SharedStage(Stage):

@@ -22,7 +22,7 @@ from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
 from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
 from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.simulation.board_twin import BoardTwin
 from morpheyes_daemon.simulation.estimator import EstimatorNoise
 from morpheyes_daemon.simulation.rig_twin import RANGE_M, RigTwin

@@ -15,7 +15,7 @@ from typing import Protocol
 from morpheyes_daemon.clock import MS, Clock, S
 from morpheyes_daemon.config.vehicle import NoServoConfig, VehicleConfig
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor

@@ -26,8 +26,8 @@ from morpheyes_daemon.flights.lockstep import Crew, Progress, conduct, make_crew
 from morpheyes_daemon.flights.referee import Judge
 from morpheyes_daemon.flights.sim_vehicle import Scenario, Stage
 from morpheyes_daemon.flights.sitl import open_sitl
-from morpheyes_daemon.messages import RawPair
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import RawPair
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.autopilot_core import TICK_NS

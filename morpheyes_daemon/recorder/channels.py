@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages import Event, FloatMap, Image, Perception, VehicleState
+from morpheyes_daemon.messages.core import Event, FloatMap, Image, Perception, VehicleState
 from morpheyes_daemon.recorder.encoding import to_plain, type_name
 from morpheyes_daemon.recorder.schemas import dataclass_schema, schema_text, timestamp
 from morpheyes_daemon.stereo.colours import colour_depth

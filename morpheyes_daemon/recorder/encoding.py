@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from morpheyes_daemon.errors import RecordingError
-from morpheyes_daemon.messages import Perception, StereoFrame
+from morpheyes_daemon.messages.core import Perception, StereoFrame
 from morpheyes_daemon.strategies.base import Observation
 
 LARGEST_LIST = 64

@@ -19,7 +19,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from morpheyes_daemon.errors import InputError, RecordingError
-from morpheyes_daemon.messages import Event
+from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.recorder.channels import EVENTS
 from morpheyes_daemon.recorder.encoding import find_type, from_plain
 from morpheyes_daemon.recorder.flight_log import CHUNK_BYTES, HEADER, LIBRARY

@@ -19,8 +19,8 @@ from typing import Any
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, S
-from morpheyes_daemon.messages import Event, Perception, StereoFrame
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event, Perception, StereoFrame
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.recorder.channels import entries, ned_entry
 from morpheyes_daemon.recorder.flight_log import FlightLog
 

@@ -52,7 +52,7 @@ _FOXGLOVE: dict[str, dict[str, Any]] = {
         "name": _TEXT,
         "file": _TEXT,
         "line": {"type": "integer"},
-        "event": {"type": "object", "title": "morpheyes_daemon.messages.Event"},
+        "event": {"type": "object", "title": "morpheyes_daemon.messages.core.Event"},
     },
 }
 

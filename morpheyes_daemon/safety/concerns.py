@@ -7,8 +7,8 @@ autopilot itself does about it (RTL, LAND) comes as a mode change, which release
 from __future__ import annotations
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 
 CRITICAL = 5
 """MAV_STATE_CRITICAL: ArduCopter reports it while any failsafe is triggered; what is above is worse."""

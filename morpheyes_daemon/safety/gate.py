@@ -14,8 +14,8 @@ from enum import StrEnum
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.errors import DeviceError
-from morpheyes_daemon.messages import Sticks
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Sticks
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.states import EFFECTS, Action, State
 
 RELEASE_REPEAT_S = 1.0

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import VehicleConfig
-from morpheyes_daemon.messages import VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.concerns import concern
 from morpheyes_daemon.safety.gate import LEASE_REASONS, Gate, GateOutput, Lease
 from morpheyes_daemon.safety.states import HOLDING, Action, Machine, State, Transition, Trigger

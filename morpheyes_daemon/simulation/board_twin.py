@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Mount
-from morpheyes_daemon.messages import FloatMap, Image, Pinhole, RawPair
+from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole, RawPair
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.renderer import Rendered, Renderer
 from morpheyes_daemon.simulation.rig_twin import RigTwin, T_frd_rig

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.config.vehicle import Mount
-from morpheyes_daemon.messages import FloatMap, Image, Pinhole, RawPair, frozen
+from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole, RawPair, frozen
 from morpheyes_daemon.simulation.develop import NOISE, develop
 from morpheyes_daemon.simulation.renderer import Rendered, Renderer
 from morpheyes_daemon.simulation.rig_twin import RigTwin, T_frd_rig

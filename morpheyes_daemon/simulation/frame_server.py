@@ -12,7 +12,7 @@ import os
 from collections.abc import AsyncIterator, Awaitable, Callable
 
 from morpheyes_daemon.clock import Clock, Ticker
-from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.wire.frames import TcpAddress, encode_pair, parse_address
 
 

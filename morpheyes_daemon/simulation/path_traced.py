@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.messages import FloatMap, Pinhole
+from morpheyes_daemon.messages.core import FloatMap, Pinhole
 from morpheyes_daemon.simulation.scene import Light, Material, Mesh, Scene
 from morpheyes_daemon.simulation.textures import Texture
 from morpheyes_daemon.transforms import Array

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.messages import FloatMap, Image, Pinhole
+from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole
 from morpheyes_daemon.simulation.raster import COUNT, PLANES, SAMPLES, TILE, rasterise, visible_parts
 from morpheyes_daemon.simulation.scene import SKY_OBJECT, Material, Mesh, Scene
 from morpheyes_daemon.simulation.shading import shade_image

@@ -8,7 +8,7 @@ from functools import cache
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages import FloatMap, Image
+from morpheyes_daemon.messages.core import FloatMap, Image
 
 MIN_BASELINE_M = 0.1
 MAX_BASELINE_M = 0.3

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.config.vehicle import StereoConfig
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages import DepthMap, FloatMap, Image, StereoFrame, frozen
+from morpheyes_daemon.messages.core import DepthMap, FloatMap, Image, StereoFrame, frozen
 from morpheyes_daemon.stereo.matching import Match, MatchSettings, disparity_range, match
 from morpheyes_daemon.stereo.rectify import Rectification, Rectifier
 from morpheyes_daemon.stereo.rig import RigModel

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.messages import FloatMap, Image, Pinhole
+from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole
 from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.transforms import Array
 

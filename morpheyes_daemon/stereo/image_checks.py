@@ -13,7 +13,7 @@ from enum import StrEnum
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages import Image
+from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.stereo.epipolar import MIN_POINTS, RowOffsets
 from morpheyes_daemon.stereo.matching import MatchSettings, semi_global
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages import FloatMap, Image
+from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.stereo.colours import UNKNOWN_BGR, colour_depth
 from morpheyes_daemon.stereo.still import StillDepth, halves
 

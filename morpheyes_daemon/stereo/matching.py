@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages import FloatMap, Image
+from morpheyes_daemon.messages.core import FloatMap, Image
 
 Mask = NDArray[np.bool_]
 

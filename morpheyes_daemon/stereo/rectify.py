@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import CalibrationError
-from morpheyes_daemon.messages import FloatMap, Image, Pinhole, frozen
+from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole, frozen
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import Array, inverse, pose

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import CalibrationError, InputError
-from morpheyes_daemon.messages import BaselineEstimate, FloatMap, Image, StereoFrame
+from morpheyes_daemon.messages.core import BaselineEstimate, FloatMap, Image, StereoFrame
 from morpheyes_daemon.stereo.depth import DepthEstimator, depth_from_disparity, grey, near_limit_m
 from morpheyes_daemon.stereo.matching import MatchSettings, disparity_range, match
 from morpheyes_daemon.stereo.rig import RigModel

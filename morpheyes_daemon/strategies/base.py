@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from morpheyes_daemon.config.vehicle import Footprint, Section
-from morpheyes_daemon.messages import DepthMap, DepthSummary, Image, MissionCommand, Track, Vector, VehicleState
+from morpheyes_daemon.messages.core import DepthMap, DepthSummary, Image, MissionCommand, Track, Vector, VehicleState
 from morpheyes_daemon.transforms import R_from_rpy
 
 

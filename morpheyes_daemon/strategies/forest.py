@@ -18,8 +18,8 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.control.baseline import baseline_for
 from morpheyes_daemon.control.pid import Pid, PidGains
-from morpheyes_daemon.messages import Intent, MissionCommand, VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Intent, MissionCommand, VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, StrategyParameters, View
 from morpheyes_daemon.strategies.corridor import free_distance_m
 from morpheyes_daemon.strategies.memory import ObstacleMemory

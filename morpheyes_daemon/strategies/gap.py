@@ -17,8 +17,8 @@ import numpy as np
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.control.baseline import baseline_for
-from morpheyes_daemon.messages import Intent, Line, MissionCommand
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Intent, Line, MissionCommand
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, View
 from morpheyes_daemon.strategies.gap_crossing import Crossing
 from morpheyes_daemon.strategies.gap_parameters import GapParameters

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages import DepthMap, FloatMap, Pinhole
+from morpheyes_daemon.messages.core import DepthMap, FloatMap, Pinhole
 from morpheyes_daemon.strategies.wall import Box, Mask, Plane, Split, median
 from morpheyes_daemon.transforms import Array
 

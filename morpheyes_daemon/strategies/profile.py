@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.strategies.base import View
 from morpheyes_daemon.strategies.rise import ground_rise
 from morpheyes_daemon.transforms import R_FRD_CAM

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.messages import DepthMap, FloatMap
+from morpheyes_daemon.messages.core import DepthMap, FloatMap
 from morpheyes_daemon.transforms import Array
 
 Mask = NDArray[np.bool_]

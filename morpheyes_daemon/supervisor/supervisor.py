@@ -14,8 +14,8 @@ from typing import Any
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import Clock, S, Ticker
 from morpheyes_daemon.errors import MorphEyesError, mistake
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.guardian import Guardian
 

@@ -6,7 +6,7 @@ from typing import Protocol
 
 from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.devices.camera import Camera
-from morpheyes_daemon.messages import BaselineEstimate, StereoFrame
+from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame
 from morpheyes_daemon.safety.gate import Gate, Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
 

@@ -9,8 +9,8 @@ from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.control.governor import Stopping
 from morpheyes_daemon.control.pose_history import VehicleTrack
-from morpheyes_daemon.messages import Intent, Perception
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Intent, Perception
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.guardian import Guardian
 from morpheyes_daemon.safety.states import State

@@ -6,7 +6,7 @@ from typing import Protocol
 
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import Clock, Ticker
-from morpheyes_daemon.messages import FloatMap
+from morpheyes_daemon.messages.core import FloatMap
 from morpheyes_daemon.safety.gate import Gate, Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
 

@@ -8,8 +8,8 @@ from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import MS, Clock, Ticker
 from morpheyes_daemon.control.pose_history import VehicleTrack
 from morpheyes_daemon.control.stick_controller import FlightControl
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.guardian import Guardian
 from morpheyes_daemon.safety.states import State

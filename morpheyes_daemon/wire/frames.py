@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.messages import Image, RawPair
+from morpheyes_daemon.messages.core import Image, RawPair
 
 MAGIC = b"MEYE"
 VERSION = 1

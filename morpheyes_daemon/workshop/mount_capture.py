@@ -24,7 +24,7 @@ from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
-from morpheyes_daemon.messages import Image, VehicleState
+from morpheyes_daemon.messages.core import Image, VehicleState
 from morpheyes_daemon.transforms import Array, R_from_rpy, rotvec_from_R
 from morpheyes_daemon.workshop.capture import note_board, write_pair
 from morpheyes_daemon.workshop.stand import RigStand

@@ -16,7 +16,7 @@ from morpheyes_daemon.control.baseline_planner import OVERSHOOT_M
 from morpheyes_daemon.devices.camera import Camera, build_camera
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.devices.servo import Servo, build_servo
-from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.messages.core import RawPair
 
 
 class RigStand:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.messages import VehicleState
+from morpheyes_daemon.messages.core import VehicleState
 from tests.contract.test_autopilot_hub import with_hub
 from tests.hub_bench import HubBench
 

@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import MS, S, run_virtual, wall_time_s
 from morpheyes_daemon.errors import ConfigError, DeviceError, DeviceTimeoutError
-from morpheyes_daemon.messages import VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED
 from morpheyes_daemon.simulation.flight_modes import Mode
 from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride, Decoder, Encoder, Identity, Signing

@@ -19,8 +19,8 @@ from morpheyes_daemon.dashboard import server
 from morpheyes_daemon.dashboard.server import CLIENTS, PAGES, Dashboard
 from morpheyes_daemon.dashboard.snapshot import STRIPS
 from morpheyes_daemon.errors import DeviceNotFoundError
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.tasks.health import Health
 from tests.hand_clock import HandClock

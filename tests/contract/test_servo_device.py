@@ -17,8 +17,8 @@ from morpheyes_daemon.devices.link import Link, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.devices.servo.teensy import SerialServo
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.simulation.teensy_twin import ServoFault, ServoTruth, TeensyTwin
 
 MOTION = ServoMotion()

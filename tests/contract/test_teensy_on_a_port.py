@@ -12,8 +12,8 @@ from morpheyes_daemon.clock import MonotonicClock
 from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.devices.link import open_link
 from morpheyes_daemon.devices.servo.teensy import SerialServo
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.simulation.pseudo_terminal import PseudoTerminal
 from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
 

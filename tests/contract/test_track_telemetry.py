@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import S, run_virtual
 from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig
-from morpheyes_daemon.messages import Perception, Track
+from morpheyes_daemon.messages.core import Perception, Track
 from morpheyes_daemon.strategies.imo.strategy import ImoPercept
 from tests.noisy_daemon import NoisyDaemon
 from tests.seen_from_above import SUMMARY, empty_profile

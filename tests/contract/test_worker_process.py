@@ -18,7 +18,7 @@ import pytest
 
 from morpheyes_daemon.clock import MS, run_virtual, running_clock
 from morpheyes_daemon.errors import CalibrationError
-from morpheyes_daemon.messages import BaselineEstimate, StereoFrame
+from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame
 from morpheyes_daemon.supervisor.mailbox import Mailbox
 from morpheyes_daemon.supervisor.worker import InlineWorker, WorkerFailed, WorkerLost
 from morpheyes_daemon.supervisor.worker_process import ProcessWorker

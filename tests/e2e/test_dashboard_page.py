@@ -9,8 +9,8 @@ from aiohttp.test_utils import TestServer
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.dashboard.server import Dashboard
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.tasks.health import Health
 from tests.hand_clock import HandClock

@@ -21,8 +21,8 @@ from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.devices.link import open_link
 from morpheyes_daemon.errors import DeviceTimeoutError
-from morpheyes_daemon.messages import VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride
 
 URL = os.environ.get("MORPHEYES_SITL", "")

@@ -22,7 +22,7 @@ from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.flights.realtime import RealtimeFlight, fly_realtime, realtime_daemon
 from morpheyes_daemon.flights.simulator_process import PilotAct
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import Action, State
 

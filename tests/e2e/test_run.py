@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from morpheyes_daemon.cli import build
 from morpheyes_daemon.clock import MonotonicClock
 from morpheyes_daemon.daemon.service import ending_by_signal
-from morpheyes_daemon.messages import Perception
+from morpheyes_daemon.messages.core import Perception
 from morpheyes_daemon.recorder.reader import Flight, read_flight
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import Action

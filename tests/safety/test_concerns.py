@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.concerns import concern
 
 NOW_NS = 1000 * S

@@ -8,8 +8,8 @@ from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config.vehicle import NoServoConfig, SerialServoConfig
 from morpheyes_daemon.daemon.composition import ALARMS
 from morpheyes_daemon.doctor.findings import Severity
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.states import State
 from tests.noisy_daemon import NoisyDaemon
 from tests.unit.test_doctor_parameters import BAD

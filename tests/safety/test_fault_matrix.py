@@ -16,7 +16,7 @@ from morpheyes_daemon.fault_injection.harness import Measured, Sent, TruePath
 from morpheyes_daemon.fault_injection.matrix import FAULTS
 from morpheyes_daemon.fault_injection.report import page
 from morpheyes_daemon.fault_injection.runner import Row, choose, flights, load_rows, make_row, store_row
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.flight_modes import Mode
 

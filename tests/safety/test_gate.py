@@ -9,8 +9,8 @@ import pytest
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.errors import DeviceError
-from morpheyes_daemon.messages import Sticks
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Sticks
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import (
     LEASE_REASONS,
     Gate,

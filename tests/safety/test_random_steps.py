@@ -12,7 +12,7 @@ from collections import Counter
 import pytest
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.guardian import GuardianLimits
 from morpheyes_daemon.safety.states import State

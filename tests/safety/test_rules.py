@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.guardian import GuardianLimits
 from morpheyes_daemon.safety.states import EFFECTS, HOLDING, Action, State

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.document import PAGE, renewed, sections
 from morpheyes_daemon.safety.states import (
     CAUSE,

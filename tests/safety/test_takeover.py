@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.states import HOLDING, Action, State
 from tests.cockpit import OFF_US, ON_US, Cockpit

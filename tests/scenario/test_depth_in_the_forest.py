@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("numba", reason="the renderer needs the extra `sim`")
 
-from morpheyes_daemon.messages import BaselineEstimate, StereoFrame
+from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.renderer import Renderer
 from morpheyes_daemon.simulation.rig_twin import RigTwin

@@ -10,8 +10,8 @@ from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
 from morpheyes_daemon.flights.sim_vehicle import Stage
-from morpheyes_daemon.messages import Intent, MissionCommand
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Intent, MissionCommand
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import State
 

@@ -10,7 +10,7 @@ from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.flights.lockstep import Summary, Watchers, fly
 from morpheyes_daemon.flights.sim_vehicle import Stage
-from morpheyes_daemon.messages import Track
+from morpheyes_daemon.messages.core import Track
 
 WORLD = """
 world:

@@ -11,7 +11,7 @@ import yaml
 from morpheyes_daemon.errors import MorphEyesError
 from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.flights.lockstep import Watchers, fly
-from morpheyes_daemon.messages import MissionCommand
+from morpheyes_daemon.messages.core import MissionCommand
 from morpheyes_daemon.strategies import registry
 
 DOC = Path(__file__).parents[2] / "docs" / "strategies.md"

@@ -14,7 +14,7 @@ from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.control.baseline import BaselineModel
 from morpheyes_daemon.control.baseline_planner import BaselinePlanner
 from morpheyes_daemon.errors import DeviceError
-from morpheyes_daemon.messages import Intent, MissionCommand
+from morpheyes_daemon.messages.core import Intent, MissionCommand
 from morpheyes_daemon.supervisor.supervisor import Pulse
 from morpheyes_daemon.tasks.baseline import baseline
 

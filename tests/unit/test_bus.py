@@ -5,8 +5,8 @@ from dataclasses import fields
 
 from morpheyes_daemon.bus import EventLog, Latest, Topics
 from morpheyes_daemon.clock import run_virtual
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 
 
 def test_a_slow_reader_gets_the_newest_and_the_count_of_the_missed() -> None:

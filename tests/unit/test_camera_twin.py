@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.config.vehicle import Mount
-from morpheyes_daemon.messages import FloatMap, Image
+from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.forest import ForestWorld
 from morpheyes_daemon.simulation.renderer import Renderer

@@ -9,7 +9,7 @@ import pytest
 
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.simulation.board_twin import BoardTwin
 from morpheyes_daemon.simulation.rig_twin import RigTwin
 from morpheyes_daemon.workshop.capture import Scene, capture_boards, capture_visits

@@ -13,7 +13,7 @@ from morpheyes_daemon.config.packaged import load_config, load_mission, mission_
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.config.yaml_errors import parse_model
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 
 GOOD = "camera: {backend: v4l2}\nservo: {backend: serial}\n"
 

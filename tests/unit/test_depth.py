@@ -7,7 +7,7 @@ import pytest
 
 from morpheyes_daemon.config.vehicle import StereoConfig
 from morpheyes_daemon.errors import CalibrationError, InputError
-from morpheyes_daemon.messages import BaselineEstimate, StereoFrame
+from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame
 from morpheyes_daemon.stereo.depth import (
     DepthEstimator,
     depth_from_disparity,

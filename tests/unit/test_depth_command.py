@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.cli import main
-from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.messages.core import Pinhole
 from tests.panels import Panel, crooked_rig, ideal_pair, raw_pair
 
 PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)

@@ -26,7 +26,7 @@ from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.doctor.machine import examine_machine
 from morpheyes_daemon.doctor.rig import examine_calibration, examine_camera, examine_servo
 from morpheyes_daemon.errors import DeviceNotFoundError, DeviceTimeoutError
-from morpheyes_daemon.messages import Image, RawPair
+from morpheyes_daemon.messages.core import Image, RawPair
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import EyeMount, RigModel
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.calibration.ego_motion import EyeMotion, row_rates
-from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.stereo.epipolar import RowOffsets, RowWatch, row_offsets
 from morpheyes_daemon.stereo.matching import match
 from morpheyes_daemon.transforms import R_from_rotvec, pose

@@ -9,8 +9,8 @@ from typing import Any
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.cli.sim import _page
 from morpheyes_daemon.flights.lockstep import Summary, Tally
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 
 SIZE = (
     "the opening is 0.41 x 0.30 m with -12 mm of room; the vehicle needs 0.34 x 0.19 m and 0 mm at a baseline of 100 mm"

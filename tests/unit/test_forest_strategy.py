@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import Intent, MissionCommand, VehicleState
+from morpheyes_daemon.messages.core import Intent, MissionCommand, VehicleState
 from morpheyes_daemon.strategies.base import Observation
 from morpheyes_daemon.strategies.forest import Forest, ForestParameters, Goal
 from morpheyes_daemon.strategies.profile import ObstacleProfile

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.wire.frames import (
     HEADER_BYTES,
     TcpAddress,

@@ -8,8 +8,8 @@ import pytest
 
 from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.control.path_following import LEAN_LAG_S, LineKeeper
-from morpheyes_daemon.messages import DepthSummary, Intent, VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import DepthSummary, Intent, VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation
 from morpheyes_daemon.strategies.gap import Gap, Phase
 from morpheyes_daemon.strategies.gap_parameters import GapParameters

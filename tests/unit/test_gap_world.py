@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from morpheyes_daemon.config.vehicle import Footprint, Mount
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.flights.artifacts import wall_plan
-from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.simulation.collision import VehicleShape
 from morpheyes_daemon.simulation.gap import GapWorld, Opening
 from morpheyes_daemon.simulation.motion import Motion, along_waypoints, swaying

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
 from morpheyes_daemon.stereo.image_checks import (
     AlikeCheck,

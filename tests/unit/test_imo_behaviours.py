@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import Intent, MissionCommand, Track, VehicleState
+from morpheyes_daemon.messages.core import Intent, MissionCommand, Track, VehicleState
 from morpheyes_daemon.strategies.base import Observation
 from morpheyes_daemon.strategies.imo.behaviours import (
     Dodge,

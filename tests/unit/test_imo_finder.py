@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from morpheyes_daemon.messages import Track
+from morpheyes_daemon.messages.core import Track
 from morpheyes_daemon.strategies.imo.finder import Finder
 from tests.moving_square import Square, moved, view
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from morpheyes_daemon.campaigns.imo_metrics import Sample, range_bins, visible_face
-from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.strategies.imo.clusters import clusters
 from morpheyes_daemon.strategies.imo.ego_motion import refine
 from morpheyes_daemon.strategies.imo.filter import Eyes, ObjectFilter, measurement_covariance

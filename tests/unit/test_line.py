@@ -12,7 +12,7 @@ from morpheyes_daemon.control.path_following import (
     MISSED_MOST_M_S,
     LineKeeper,
 )
-from morpheyes_daemon.messages import Intent, Line, MissionCommand, VehicleState
+from morpheyes_daemon.messages.core import Intent, Line, MissionCommand, VehicleState
 
 S = 1_000_000_000
 

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from morpheyes_daemon.errors import RecordingError
-from morpheyes_daemon.messages import DepthSummary, Event, Governed, Perception, VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import DepthSummary, Event, Governed, Perception, VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.recorder.encoding import find_type, from_plain, to_plain, type_name
 from morpheyes_daemon.recorder.schemas import dataclass_schema
 from morpheyes_daemon.safety.gate import GateOutput
@@ -73,7 +73,7 @@ def test_a_value_whose_field_says_nothing_carries_its_own_type() -> None:
 def test_a_log_cannot_make_us_import_foreign_modules() -> None:
     assert find_type("antigravity.Finding") is None
     assert find_type(type_name(Finding)) is Finding
-    assert find_type("morpheyes_daemon.messages.Governed") is Governed
+    assert find_type("morpheyes_daemon.messages.core.Governed") is Governed
 
 
 def test_full_images_are_left_out() -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.stereo.matching import MatchSettings, _forget_islands, _one_eyed, _runs, disparity_range, match
 from tests.panels import Panel, ideal_pair
 

@@ -9,8 +9,8 @@ from typing import Any
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import MS, S, run_virtual, running_clock
 from morpheyes_daemon.control.pose_history import VehicleTrack
-from morpheyes_daemon.messages import DepthSummary, Intent, Perception
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import DepthSummary, Intent, Perception
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.supervisor.supervisor import Pulse

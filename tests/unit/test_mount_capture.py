@@ -13,7 +13,7 @@ import pytest
 from morpheyes_daemon.calibration.solver.mount import ATTITUDES, attitude_rows
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import RawPair, VehicleState
+from morpheyes_daemon.messages.core import RawPair, VehicleState
 from morpheyes_daemon.simulation.board_twin import BoardTwin
 from morpheyes_daemon.simulation.rig_twin import RigTwin
 from morpheyes_daemon.transforms import Array, R_from_rpy, rpy_from_R

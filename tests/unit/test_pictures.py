@@ -10,8 +10,8 @@ import pytest
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Footprint
-from morpheyes_daemon.messages import BaselineEstimate, VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import BaselineEstimate, VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import DPI, LEFT_IN, RIGHT_IN, WIDTH_IN, draw_map
 from morpheyes_daemon.recorder.pictures.outline import Track, clearances, closest_passes

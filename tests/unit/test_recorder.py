@@ -11,8 +11,8 @@ from mcap.reader import make_reader
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import MonotonicClock, S
 from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig, SimCameraConfig, VehicleConfig
-from morpheyes_daemon.messages import Event, Sticks
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event, Sticks
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.recorder.flight_log import CHUNK_BYTES, flight_header, flight_path
 from morpheyes_daemon.recorder.reader import Flight, read_flight
 from morpheyes_daemon.recorder.recorder import QUEUE_LIMIT, Recorder

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from morpheyes_daemon.errors import CalibrationError
-from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rectify import CACHED, Rectifier, pixels, rays, rectify, rectifying_rotation
 from morpheyes_daemon.stereo.rig import RigModel

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from morpheyes_daemon.messages import Pinhole
+from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.simulation import meshes
 from morpheyes_daemon.simulation.forest import ForestWorld
 from morpheyes_daemon.simulation.renderer import Rendered, Renderer

@@ -10,7 +10,7 @@ import pytest
 
 from morpheyes_daemon.calibration.ego_motion import EyeMotion
 from morpheyes_daemon.calibration.scale_watch import ScaleWatch, Sight, scale_between
-from morpheyes_daemon.messages import DepthMap, Pinhole
+from morpheyes_daemon.messages.core import DepthMap, Pinhole
 from morpheyes_daemon.transforms import R_from_rotvec, pose
 
 PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from morpheyes_daemon.daemon.service import SystemdReport, chain_turns, event_line
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.tasks.health import Health
 

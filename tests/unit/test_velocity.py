@@ -11,7 +11,7 @@ import pytest
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.velocity import VelocityController, VelocityTuning, height_above_ground_m
-from morpheyes_daemon.messages import Sticks, VehicleState
+from morpheyes_daemon.messages.core import Sticks, VehicleState
 from tests.copter_parameters import copter_parameters
 from tests.loiter_plant import LoiterPlant
 

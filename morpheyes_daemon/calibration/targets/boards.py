@@ -17,7 +17,7 @@ import numpy as np
 
 from morpheyes_daemon.calibration.targets.subpixel import saddle_points
 from morpheyes_daemon.errors import UsageError
-from morpheyes_daemon.messages import Image
+from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.transforms import Array
 
 _WINDOW_SHARE = 0.3

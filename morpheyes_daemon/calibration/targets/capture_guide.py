@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners, spacing_px
 from morpheyes_daemon.calibration.targets.coverage import CELLS, cell_of, count_cells, empty_corners
-from morpheyes_daemon.messages import Image
+from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.transforms import Array
 
 BASELINE_VIEWS = 12

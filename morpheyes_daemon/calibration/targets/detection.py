@@ -22,7 +22,7 @@ from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_cor
 from morpheyes_daemon.calibration.targets.image_pairs import BaselineFolder, PairFiles
 from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages import Image
+from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.transforms import Array
 
 _FEWEST_VIEWS = 3

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages import Image
+from morpheyes_daemon.messages.core import Image
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 _SIDE_BY_SIDE_ASPECT = 1.9

@@ -13,7 +13,7 @@ import typer
 if TYPE_CHECKING:
     from morpheyes_daemon.calibration.checks import CheckResult, RigCheck
     from morpheyes_daemon.config.vehicle import VehicleConfig
-    from morpheyes_daemon.messages import Image
+    from morpheyes_daemon.messages.core import Image
     from morpheyes_daemon.workshop.capture import Scene
 
 BoardOption = Annotated[

@@ -25,8 +25,8 @@ from morpheyes_daemon.devices.autopilot.telemetry import Telemetry
 from morpheyes_daemon.devices.autopilot.transmitter import Transmitter, may_relay
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceTimeoutError
-from morpheyes_daemon.messages import Event, VehicleState
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event, VehicleState
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.wire.mavlink import (
     ChannelOverride,
     Decoder,

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 from morpheyes_daemon.devices.autopilot.boot_clock import BootClock
-from morpheyes_daemon.messages import VehicleState
+from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.wire.mavlink import Message
 
 ARMED_FLAG = 128

@@ -7,7 +7,7 @@ from typing import Protocol
 from morpheyes_daemon.clock import Clock
 from morpheyes_daemon.config.vehicle import CameraConfig, RecordingCameraConfig, V4l2CameraConfig
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.messages.core import RawPair
 
 
 class Camera(Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from morpheyes_daemon.errors import DeviceError, DeviceTimeoutError
-from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.messages.core import RawPair
 
 
 class NewestPair:

@@ -18,7 +18,7 @@ import numpy as np
 from morpheyes_daemon.clock import Clock, Ticker
 from morpheyes_daemon.config.vehicle import RecordingCameraConfig
 from morpheyes_daemon.errors import DeviceLostError, InputError
-from morpheyes_daemon.messages import Image, RawPair, frozen
+from morpheyes_daemon.messages.core import Image, RawPair, frozen
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".pnm"}
 _SIDE = re.compile(r"(left|right)[-_ ]?(.*)", re.IGNORECASE)

@@ -8,7 +8,7 @@ import contextlib
 from morpheyes_daemon.config.vehicle import CameraBase
 from morpheyes_daemon.devices.camera.newest import NewestPair
 from morpheyes_daemon.errors import DeviceLostError, DeviceNotFoundError
-from morpheyes_daemon.messages import RawPair
+from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.wire.frames import (
     HEADER_BYTES,
     TcpAddress,

@@ -20,7 +20,7 @@ from morpheyes_daemon.config.vehicle import V4l2CameraConfig
 from morpheyes_daemon.devices.camera.newest import NewestPair
 from morpheyes_daemon.devices.camera.recording import halves
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFoundError, InputError
-from morpheyes_daemon.messages import RawPair, frozen
+from morpheyes_daemon.messages.core import RawPair, frozen
 
 PATIENCE_PERIODS = 5.0
 SHORTEST_PATIENCE_S = 1.0

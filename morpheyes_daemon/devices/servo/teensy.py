@@ -15,8 +15,8 @@ from morpheyes_daemon.clock import MS, Clock, S
 from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.devices.link import Link, LinkOpener
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
-from morpheyes_daemon.messages import Event
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.core import Event
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.wire import servo as wire
 
 ANSWER_TIMEOUT_S = 0.1

@@ -17,7 +17,7 @@ import numpy as np
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Footprint
-from morpheyes_daemon.messages import BaselineEstimate, DepthSummary, Governed, Image, Perception, VehicleState
+from morpheyes_daemon.messages.core import BaselineEstimate, DepthSummary, Governed, Image, Perception, VehicleState
 from morpheyes_daemon.recorder.channels import DEPTH_IMAGE, LEFT_IMAGE
 from morpheyes_daemon.recorder.pictures.scene import Scene
 from morpheyes_daemon.recorder.pictures.topview import Pose, TopView

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.config.vehicle import Footprint
-from morpheyes_daemon.messages import Image
+from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.recorder.pictures.outline import boxes, placed
 from morpheyes_daemon.recorder.pictures.scene import Scene
 from morpheyes_daemon.stereo.colours import baseline_bgr

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from morpheyes_daemon.errors import RecordingError
-from morpheyes_daemon.messages import Image
+from morpheyes_daemon.messages.core import Image
 
 MILLISECONDS = Fraction(1, 1000)
 CODEC = {"preset": "superfast", "crf": "27"}

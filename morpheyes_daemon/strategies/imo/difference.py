@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.messages import FloatMap
+from morpheyes_daemon.messages.core import FloatMap
 from morpheyes_daemon.strategies.imo.frames import Frame
 from morpheyes_daemon.transforms import Array, inverse
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.messages import Image
+from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.strategies.imo.frames import Frame
 from morpheyes_daemon.transforms import Array

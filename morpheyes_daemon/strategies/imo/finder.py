@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.messages import DepthMap, Track
+from morpheyes_daemon.messages.core import DepthMap, Track
 from morpheyes_daemon.strategies.base import View
 from morpheyes_daemon.strategies.imo.clusters import Cluster, clusters
 from morpheyes_daemon.strategies.imo.filter import (

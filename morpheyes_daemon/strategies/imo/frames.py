@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.messages import FloatMap, Image, Pinhole
+from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole
 from morpheyes_daemon.strategies.base import View
 from morpheyes_daemon.transforms import Array
 

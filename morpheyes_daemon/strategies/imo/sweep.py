@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages import FloatMap
+from morpheyes_daemon.messages.core import FloatMap
 from morpheyes_daemon.strategies.imo.frames import Frame
 
 BLOCK_PX = 5

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages import FloatMap
+from morpheyes_daemon.messages.core import FloatMap
 from morpheyes_daemon.strategies.imo.features import Mask
 from morpheyes_daemon.strategies.imo.frames import Frame
 from morpheyes_daemon.strategies.imo.sweep import swept_depth

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.reasons import Reason
+from morpheyes_daemon.messages.reasons import Reason
 
 Image = NDArray[np.uint8]
 FloatMap = NDArray[np.float32]

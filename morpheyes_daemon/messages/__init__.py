@@ -1,0 +1,1 @@
+"""What topics and events carry: frozen dataclasses and reason codes."""
