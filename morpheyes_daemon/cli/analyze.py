@@ -17,8 +17,8 @@ def command(
     import json
 
     from morpheyes_daemon.errors import InputError
-    from morpheyes_daemon.experiments.theory_analysis import analysis, paper_subject, rig_subject
-    from morpheyes_daemon.experiments.theory_figures import draw_all
+    from morpheyes_daemon.paper.error_analysis import analysis, paper_subject, rig_subject
+    from morpheyes_daemon.paper.figures import draw_all
     from morpheyes_daemon.stereo.rig import RigModel
 
     subject = paper_subject() if rig is None else rig_subject(RigModel.load(rig), rig.name)

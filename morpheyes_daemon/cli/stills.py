@@ -29,8 +29,8 @@ def command(
 
     require_simulator()
     require_figures()
-    from morpheyes_daemon.experiments.stills import StillPlan, make_stills
     from morpheyes_daemon.flights.flight_plan import parse_size
+    from morpheyes_daemon.paper.path_traced_stills import StillPlan, make_stills
 
     plan = StillPlan(
         world, seed, first_m, steps, step_m, height_m, yaw_deg, baseline, parse_size(size), samples

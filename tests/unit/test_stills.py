@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morpheyes_daemon.experiments.stills import StillPlan, make_stills
+from morpheyes_daemon.paper.path_traced_stills import StillPlan, make_stills
 
 pytest.importorskip("numba")
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morpheyes_daemon.experiments.theory_analysis import SYNC_DT_S, analysis, paper_subject, rig_subject
+from morpheyes_daemon.paper.error_analysis import SYNC_DT_S, analysis, paper_subject, rig_subject
 from morpheyes_daemon.stereo.depth import depth_sigma
 from morpheyes_daemon.theory import sync
 from morpheyes_daemon.theory.calibration_error import (

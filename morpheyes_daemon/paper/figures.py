@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from morpheyes_daemon.experiments.theory_analysis import (
+from morpheyes_daemon.paper.error_analysis import (
     DEPTHS_M,
     DISPARITY_ERROR_PX,
     SYNC_DT_S,
