@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from morpheyes_daemon.benchmarks.calibration_error import evaluate_rig
-from morpheyes_daemon.calibration.drift import DriftLimits, DriftMonitor, DriftReport
-from morpheyes_daemon.calibration.ego_motion import EyeMotion, eye_motion
 from morpheyes_daemon.calibration.targets.observations import Progress, silent
-from morpheyes_daemon.calibration.yaw_watch import STILL, Uncertain
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Mount, ServoMotion
 from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame, VehicleState
+from morpheyes_daemon.perception.camera_motion import EyeMotion, eye_motion
+from morpheyes_daemon.perception.extrinsics_monitor import DriftLimits, DriftMonitor, DriftReport
+from morpheyes_daemon.perception.yaw_estimator import STILL, Uncertain
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.renderer import Renderer
 from morpheyes_daemon.simulation.rig_twin import RigTwin, T_frd_rig

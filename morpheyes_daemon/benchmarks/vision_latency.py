@@ -17,7 +17,7 @@ from morpheyes_daemon.clock import S, VirtualClock, VirtualLoop, stopwatch_s
 from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages.core import BaselineEstimate, Perception, RawPair, StereoFrame, VehicleState
-from morpheyes_daemon.perception import PipelineFactory, VisionJob
+from morpheyes_daemon.perception.pipeline import PipelineFactory, VisionJob
 from morpheyes_daemon.stereo.depth import DepthEstimator
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.supervisor.worker_process import ProcessWorker

@@ -30,7 +30,7 @@ from morpheyes_daemon.doctor.parameter_rules import examine_parameters
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import Event, MissionCommand, Perception, Track, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.perception import VisionJob, build_strategy
+from morpheyes_daemon.perception.pipeline import VisionJob, build_strategy
 from morpheyes_daemon.safety.gate import Gate, GateOutput, StickLimits
 from morpheyes_daemon.safety.guardian import Guardian, GuardianLimits
 from morpheyes_daemon.safety.states import Action, State, Transition

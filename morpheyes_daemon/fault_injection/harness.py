@@ -33,7 +33,7 @@ from morpheyes_daemon.flights.render_cache import SharedStage
 from morpheyes_daemon.flights.sim_vehicle import Stage, StageCamera
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.perception import PipelineFactory
+from morpheyes_daemon.perception.pipeline import PipelineFactory
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.safety.states import State

@@ -16,7 +16,7 @@ from morpheyes_daemon.devices.camera import Camera
 from morpheyes_daemon.devices.link import Link, LinkOpener, OnBytes, OnLost
 from morpheyes_daemon.errors import DeviceLostError, DeviceNotFoundError
 from morpheyes_daemon.messages.core import Perception, RawPair
-from morpheyes_daemon.perception import VisionJob
+from morpheyes_daemon.perception.pipeline import VisionJob
 from morpheyes_daemon.supervisor.worker import VisionWorker, WorkerLost
 
 Passage = Callable[[bytes, OnBytes], None]

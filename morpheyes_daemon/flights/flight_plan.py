@@ -12,7 +12,7 @@ from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.flights.lockstep import FlightPlan, sim_config
 from morpheyes_daemon.flights.sim_vehicle import Scenario
-from morpheyes_daemon.perception import fitting_rig
+from morpheyes_daemon.perception.pipeline import fitting_rig
 from morpheyes_daemon.simulation.worlds import load_world
 
 DISPARITIES_OF_PX = 640

@@ -10,7 +10,7 @@ from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.control.pose_history import VehicleTrack
 from morpheyes_daemon.messages.core import Event, Perception
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.perception import VisionJob
+from morpheyes_daemon.perception.pipeline import VisionJob
 from morpheyes_daemon.safety.gate import Gate, Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
 

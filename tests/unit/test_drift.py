@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morpheyes_daemon.calibration.drift import Drift, DriftMonitor, rows_apart_rad, turned_rig
-from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates, row_rates
 from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px
-from morpheyes_daemon.calibration.yaw_watch import leverage
 from morpheyes_daemon.messages.core import BaselineEstimate, Pinhole, StereoFrame
+from morpheyes_daemon.perception.camera_motion import EyeMotion, right_eye_rates, row_rates
+from morpheyes_daemon.perception.extrinsics_monitor import Drift, DriftMonitor, rows_apart_rad, turned_rig
+from morpheyes_daemon.perception.yaw_estimator import leverage
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
 from morpheyes_daemon.stereo.epipolar import row_offsets
 from morpheyes_daemon.stereo.rectify import rectifying_rotation

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.ego_motion import EyeMotion, row_rates
 from morpheyes_daemon.messages.core import Pinhole
+from morpheyes_daemon.perception.camera_motion import EyeMotion, row_rates
 from morpheyes_daemon.stereo.epipolar import RowOffsets, RowWatch, row_offsets
 from morpheyes_daemon.stereo.matching import match
 from morpheyes_daemon.transforms import R_from_rotvec, pose

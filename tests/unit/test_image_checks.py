@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.messages.core import Pinhole
-from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
-from morpheyes_daemon.stereo.image_checks import (
+from morpheyes_daemon.perception.image_checks import (
     AlikeCheck,
     FrozenCheck,
     ImageFault,
@@ -15,6 +14,7 @@ from morpheyes_daemon.stereo.image_checks import (
     matching_faults,
     row_shift,
 )
+from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
 from morpheyes_daemon.stereo.matching import match
 from tests.panels import Panel, ideal_pair
 

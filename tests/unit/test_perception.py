@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from morpheyes_daemon.calibration.drift import DriftMonitor
 from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.perception import Pipeline, VisionJob
+from morpheyes_daemon.perception.extrinsics_monitor import DriftMonitor
+from morpheyes_daemon.perception.pipeline import Pipeline, VisionJob
 from tests.panels import Panel, crooked_rig, raw_pair
 
 

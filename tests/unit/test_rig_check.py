@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.checks import CheckResult, RigCheck
-from morpheyes_daemon.calibration.drift import turned_rig
 from morpheyes_daemon.errors import CalibrationError, InputError
+from morpheyes_daemon.perception.calibration_check import CheckResult, RigCheck
+from morpheyes_daemon.perception.extrinsics_monitor import turned_rig
 from tests.panels import Panel, crooked_rig, raw_pair
 
 PANELS = [Panel(5.0, slope_x=0.3), Panel(2.5, x_m=(-0.3, 0.6), y_m=(-0.5, 0.3), seed=3), Panel(9.0, seed=5)]

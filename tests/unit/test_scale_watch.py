@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.ego_motion import EyeMotion
-from morpheyes_daemon.calibration.scale_watch import ScaleWatch, Sight, scale_between
 from morpheyes_daemon.messages.core import DepthMap, Pinhole
+from morpheyes_daemon.perception.camera_motion import EyeMotion
+from morpheyes_daemon.perception.depth_scale_monitor import ScaleWatch, Sight, scale_between
 from morpheyes_daemon.transforms import R_from_rotvec, pose
 
 PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.calibration.checks import CheckResult, RigCheck
     from morpheyes_daemon.config.vehicle import VehicleConfig
     from morpheyes_daemon.messages.core import Image
+    from morpheyes_daemon.perception.calibration_check import CheckResult, RigCheck
     from morpheyes_daemon.workshop.capture import Scene
 
 BoardOption = Annotated[
@@ -158,8 +158,8 @@ def repeatability(
 
 
 def _check_recorded(rig: Any, folder: Path, baseline_mm: float | None, progress: Any) -> CheckResult:
-    from morpheyes_daemon.calibration.checks import RigCheck
     from morpheyes_daemon.errors import UsageError
+    from morpheyes_daemon.perception.calibration_check import RigCheck
 
     check: RigCheck | None = None
     pairs = list(_recorded_pairs(folder))
@@ -191,9 +191,9 @@ def _recorded_pairs(folder: Path) -> Iterator[tuple[float | None, Image, Image]]
 def _check_live(rig: Any, config: VehicleConfig, frames: int, progress: Any) -> CheckResult:
     import asyncio
 
-    from morpheyes_daemon.calibration.checks import RigCheck
     from morpheyes_daemon.clock import running_clock
     from morpheyes_daemon.devices.link import open_link
+    from morpheyes_daemon.perception.calibration_check import RigCheck
     from morpheyes_daemon.workshop.stand import RigStand
 
     async def session() -> RigCheck:

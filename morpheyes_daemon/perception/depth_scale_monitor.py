@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from morpheyes_daemon.calibration.ego_motion import EyeMotion
 from morpheyes_daemon.messages.core import DepthMap, Image, Pinhole
+from morpheyes_daemon.perception.camera_motion import EyeMotion
 from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.transforms import Array, R_from_rotvec
 

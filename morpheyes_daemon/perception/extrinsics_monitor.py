@@ -15,9 +15,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from morpheyes_daemon.calibration.ego_motion import EyeMotion, row_rates
-from morpheyes_daemon.calibration.yaw_watch import Look, Uncertain, YawWatch
 from morpheyes_daemon.messages.core import KNOWN_SHARE, BaselineEstimate, DepthMap
+from morpheyes_daemon.perception.camera_motion import EyeMotion, row_rates
+from morpheyes_daemon.perception.yaw_estimator import Look, Uncertain, YawWatch
 from morpheyes_daemon.stereo.depth import RectifiedPair, disparity_of
 from morpheyes_daemon.stereo.epipolar import SHARP_S, RowFit, RowOffsets, RowWatch, levelled
 from morpheyes_daemon.stereo.rectify import rectifying_rotation

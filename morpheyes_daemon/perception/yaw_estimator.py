@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.calibration.ego_motion import EyeMotion, right_eye_rates
 from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole
+from morpheyes_daemon.perception.camera_motion import EyeMotion, right_eye_rates
 from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.transforms import Array, inverse
 

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.calibration.ego_motion import EyeMotion
-from morpheyes_daemon.calibration.yaw_watch import STILL, Look, YawWatch
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import BaselineEstimate, Image, StereoFrame
+from morpheyes_daemon.perception.camera_motion import EyeMotion
+from morpheyes_daemon.perception.yaw_estimator import STILL, Look, YawWatch
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
 from morpheyes_daemon.stereo.epipolar import RowFit, RowWatch, row_offsets
 from morpheyes_daemon.stereo.rig import RigModel

@@ -12,9 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morpheyes_daemon.calibration.drift import Drift, DriftLimits, DriftMonitor
-from morpheyes_daemon.calibration.ego_motion import EyeMotion, eye_motion
-from morpheyes_daemon.calibration.scale_watch import ScaleWatch, Sight
 from morpheyes_daemon.clock import stopwatch_s
 from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.config.yaml_errors import validate
@@ -31,9 +28,18 @@ from morpheyes_daemon.messages.core import (
     frozen,
 )
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.perception.camera_motion import EyeMotion, eye_motion
+from morpheyes_daemon.perception.depth_scale_monitor import ScaleWatch, Sight
+from morpheyes_daemon.perception.extrinsics_monitor import Drift, DriftLimits, DriftMonitor
+from morpheyes_daemon.perception.image_checks import (
+    AlikeCheck,
+    FrozenCheck,
+    ImageFault,
+    exposure_faults,
+    matching_faults,
+)
 from morpheyes_daemon.stereo.depth import DepthEstimator, RectifiedPair, disparity_of
 from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
-from morpheyes_daemon.stereo.image_checks import AlikeCheck, FrozenCheck, ImageFault, exposure_faults, matching_faults
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import Craft, Strategy, View
 from morpheyes_daemon.strategies.registry import find_strategy
