@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.experiments.replay import Replay
+    from morpheyes_daemon.recorder.replay import Replay
 
 SHOWN = 10
 
@@ -25,7 +25,7 @@ def command(
     from dataclasses import asdict
 
     from morpheyes_daemon.config.packaged import load_mission
-    from morpheyes_daemon.experiments.replay import replay
+    from morpheyes_daemon.recorder.replay import replay
 
     result = replay(file, load_mission(mission) if mission else None)
     typer.echo(json.dumps({**asdict(result), "same": not result.differences}) if as_json else _page(result))
