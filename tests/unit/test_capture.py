@@ -10,9 +10,9 @@ import pytest
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import RawPair
+from morpheyes_daemon.rig_capture.board_capture import Scene, capture_boards, capture_visits
 from morpheyes_daemon.simulation.board_twin import BoardTwin
 from morpheyes_daemon.simulation.rig_twin import RigTwin
-from morpheyes_daemon.workshop.capture import Scene, capture_boards, capture_visits
 
 BOARD = Board(5, 4, 0.04)
 

@@ -14,10 +14,10 @@ from morpheyes_daemon.calibration.solver.mount import ATTITUDES, attitude_rows
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import RawPair, VehicleState
+from morpheyes_daemon.rig_capture.mount_capture import capture_mount
 from morpheyes_daemon.simulation.board_twin import BoardTwin
 from morpheyes_daemon.simulation.rig_twin import RigTwin
 from morpheyes_daemon.transforms import Array, R_from_rpy, rpy_from_R
-from morpheyes_daemon.workshop.mount_capture import capture_mount
 
 BOARD = Board(5, 4, 0.04)
 Held = list[tuple[RawPair, Array]]

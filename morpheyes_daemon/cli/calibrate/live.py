@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from morpheyes_daemon.config.vehicle import VehicleConfig
     from morpheyes_daemon.messages.core import Image
     from morpheyes_daemon.perception.calibration_check import CheckResult, RigCheck
-    from morpheyes_daemon.workshop.capture import Scene
+    from morpheyes_daemon.rig_capture.board_capture import Scene
 
 BoardOption = Annotated[
     str | None, typer.Option("--board", help="Inner corners such as 9x6, or squares such as charuco:10x7:5X5_1000.")
@@ -57,9 +57,9 @@ def capture(
     from morpheyes_daemon.clock import running_clock
     from morpheyes_daemon.config.packaged import load_config
     from morpheyes_daemon.devices.link import open_link
-    from morpheyes_daemon.workshop.capture import capture_boards, capture_visits
-    from morpheyes_daemon.workshop.mount_capture import HandHeldVehicle, capture_mount
-    from morpheyes_daemon.workshop.stand import RigStand
+    from morpheyes_daemon.rig_capture.board_capture import capture_boards, capture_visits
+    from morpheyes_daemon.rig_capture.mount_capture import HandHeldVehicle, capture_mount
+    from morpheyes_daemon.rig_capture.rig_session import RigStand
 
     vehicle = load_config(config)
     known = read_board_file(out) if out.is_dir() else {}
@@ -194,7 +194,7 @@ def _check_live(rig: Any, config: VehicleConfig, frames: int, progress: Any) -> 
     from morpheyes_daemon.clock import running_clock
     from morpheyes_daemon.devices.link import open_link
     from morpheyes_daemon.perception.calibration_check import RigCheck
-    from morpheyes_daemon.workshop.stand import RigStand
+    from morpheyes_daemon.rig_capture.rig_session import RigStand
 
     async def session() -> RigCheck:
         check = RigCheck(rig, (config.camera.width_px, config.camera.height_px))

@@ -17,7 +17,7 @@ from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.calibration.targets.capture_guide import CaptureGuide, Hint
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import RawPair
-from morpheyes_daemon.workshop.stand import RigStand
+from morpheyes_daemon.rig_capture.rig_session import RigStand
 
 
 @dataclass(frozen=True)

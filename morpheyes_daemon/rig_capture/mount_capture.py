@@ -25,9 +25,9 @@ from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
 from morpheyes_daemon.messages.core import Image, VehicleState
+from morpheyes_daemon.rig_capture.board_capture import note_board, write_pair
+from morpheyes_daemon.rig_capture.rig_session import RigStand
 from morpheyes_daemon.transforms import Array, R_from_rpy, rotvec_from_R
-from morpheyes_daemon.workshop.capture import note_board, write_pair
-from morpheyes_daemon.workshop.stand import RigStand
 
 STILL_RAD_S = 0.03
 FRESH_NS = S // 5
