@@ -12,7 +12,7 @@ from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.core import Sticks, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import Gate, GateOutput, Lease, StickLimits
-from morpheyes_daemon.safety.guardian import Guardian, GuardianLimits
+from morpheyes_daemon.safety.monitor import Guardian, GuardianLimits
 from morpheyes_daemon.safety.states import Action, State, Transition
 from tests.guardian_witness import Witness
 

@@ -32,7 +32,7 @@ from morpheyes_daemon.messages.core import Event, MissionCommand, Perception, Tr
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.perception.pipeline import VisionJob, build_strategy
 from morpheyes_daemon.safety.gate import Gate, GateOutput, StickLimits
-from morpheyes_daemon.safety.guardian import Guardian, GuardianLimits
+from morpheyes_daemon.safety.monitor import Guardian, GuardianLimits
 from morpheyes_daemon.safety.states import Action, State, Transition
 from morpheyes_daemon.supervisor.supervisor import Supervisor, Task
 from morpheyes_daemon.supervisor.worker import VisionWorker

@@ -19,7 +19,7 @@ from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.doctor.parameter_rules import examine_parameters
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import Event, VehicleState
-from morpheyes_daemon.safety.concerns import GPS, aided, ekf_healthy
+from morpheyes_daemon.safety.vehicle_health import GPS, aided, ekf_healthy
 from morpheyes_daemon.wire.mavlink import dialect
 
 LINK_S, PARAMETERS_S = 8.0, 60.0

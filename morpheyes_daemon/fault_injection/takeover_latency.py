@@ -24,7 +24,7 @@ from morpheyes_daemon.fault_injection.fork import branch
 from morpheyes_daemon.fault_injection.harness import FaultFlight, Sent
 from morpheyes_daemon.flights.flight_plan import with_seed
 from morpheyes_daemon.flights.lockstep import FlightPlan
-from morpheyes_daemon.safety.guardian import LOITER
+from morpheyes_daemon.safety.monitor import LOITER
 from morpheyes_daemon.safety.states import HOLDING, State
 from morpheyes_daemon.simulation.flight_modes import Mode
 

@@ -12,7 +12,7 @@ from morpheyes_daemon.clock import S, Ticker
 from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.guardian import NOT_RESUMED
+from morpheyes_daemon.safety.monitor import NOT_RESUMED
 from morpheyes_daemon.safety.states import State
 
 RATE_HZ = 50.0

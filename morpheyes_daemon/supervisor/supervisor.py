@@ -17,7 +17,7 @@ from morpheyes_daemon.errors import MorphEyesError, mistake
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease
-from morpheyes_daemon.safety.guardian import Guardian
+from morpheyes_daemon.safety.monitor import Guardian
 
 RATE_HZ = 20.0
 FIRST_BACKOFF_S = 0.5

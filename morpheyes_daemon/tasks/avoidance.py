@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from morpheyes_daemon.clock import Clock, Ticker
-from morpheyes_daemon.safety.guardian import Guardian
+from morpheyes_daemon.safety.monitor import Guardian
 from morpheyes_daemon.safety.states import HOLDING
 from morpheyes_daemon.supervisor.supervisor import Pulse
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import MS, Clock, S, Ticker
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.guardian import Guardian
+from morpheyes_daemon.safety.monitor import Guardian
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.supervisor.supervisor import Pulse, Supervisor
 

@@ -12,7 +12,7 @@ from morpheyes_daemon.control.pose_history import VehicleTrack
 from morpheyes_daemon.messages.core import Intent, Perception
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import Lease
-from morpheyes_daemon.safety.guardian import Guardian
+from morpheyes_daemon.safety.monitor import Guardian
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.strategies.base import Observation, Strategy
 from morpheyes_daemon.supervisor.supervisor import Pulse

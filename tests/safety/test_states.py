@@ -7,7 +7,7 @@ import itertools
 import pytest
 
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.document import PAGE, renewed, sections
+from morpheyes_daemon.safety.generate_docs import PAGE, renewed, sections
 from morpheyes_daemon.safety.states import (
     CAUSE,
     EFFECTS,
@@ -147,7 +147,7 @@ def test_the_diagram_shows_every_way() -> None:
 
 def test_the_page_is_up_to_date() -> None:
     page = PAGE.read_text(encoding="utf-8")
-    assert renewed(page) == page, "run: python -m morpheyes_daemon.safety.document"
+    assert renewed(page) == page, "run: python -m morpheyes_daemon.safety.generate_docs"
 
 
 def test_the_page_explains_every_state_trigger_and_lease() -> None:

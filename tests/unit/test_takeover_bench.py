@@ -6,7 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.fault_injection.takeover_latency import tells_of_the_pilot
-from morpheyes_daemon.safety.guardian import LOITER
+from morpheyes_daemon.safety.monitor import LOITER
 
 CHANNEL = 7
 

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.safety.switch import EngageSwitch
+from morpheyes_daemon.safety.engage_switch import EngageSwitch
 
 START_NS = 1000 * S
 STEADY_NS, ASKING_NS = 200 * MS, S

@@ -1,6 +1,6 @@
 """Writes the generated parts of docs/safety.md: the diagram, the states, the triggers and the ways between them.
 
-`python -m morpheyes_daemon.safety.document` brings the file up to date; a test fails while it is not.
+`python -m morpheyes_daemon.safety.generate_docs` brings the file up to date; a test fails while it is not.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from morpheyes_daemon.safety.gate import LEASE_REASONS, Lease
-from morpheyes_daemon.safety.guardian import RESUMED
+from morpheyes_daemon.safety.monitor import RESUMED
 from morpheyes_daemon.safety.states import CAUSE, EFFECTS, MEANING, TRANSITIONS, State, Trigger, mermaid
 
 PAGE = Path("docs/safety.md")

@@ -11,7 +11,7 @@ from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.config.vehicle import AutopilotConfig, NoServoConfig, SafetyConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import LEASE_REASONS, RELEASE_REPEATS, Lease
-from morpheyes_daemon.safety.guardian import (
+from morpheyes_daemon.safety.monitor import (
     NOT_RESUMED,
     RESUMED,
     Guardian,

@@ -11,7 +11,7 @@ import pytest
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.concerns import concern
+from morpheyes_daemon.safety.vehicle_health import concern
 
 NOW_NS = 1000 * S
 WELL = VehicleState(system_status=4, ekf_t_ns=1, ekf_flags=0x08, battery_fraction=0.8, gcs_t_ns=NOW_NS)
