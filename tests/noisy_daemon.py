@@ -25,8 +25,8 @@ from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.messages.core import Event, RawPair, Sticks
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
-from morpheyes_daemon.simulation.vehicle import Vehicle
 from morpheyes_daemon.supervisor.worker import InlineWorker
 from morpheyes_daemon.wire import servo as servo_wire
 

@@ -16,6 +16,8 @@ from morpheyes_daemon.clock import MS, Clock, S
 from morpheyes_daemon.config.vehicle import NoServoConfig, VehicleConfig
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.messages.core import RawPair
+from morpheyes_daemon.simulation.airframe.dynamics import Truth, Vehicle
+from morpheyes_daemon.simulation.airframe.wind import WindConditions
 from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
@@ -24,8 +26,6 @@ from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.renderer import Renderer
 from morpheyes_daemon.simulation.rig_twin import RigTwin
 from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
-from morpheyes_daemon.simulation.vehicle import Truth, Vehicle
-from morpheyes_daemon.simulation.wind import WindConditions
 from morpheyes_daemon.simulation.worlds import World, build_world, load_world
 
 READOUT_NS = 10 * MS

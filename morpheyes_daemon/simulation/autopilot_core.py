@@ -11,6 +11,7 @@ from collections.abc import Callable
 from enum import IntEnum
 
 from morpheyes_daemon.clock import MS, S
+from morpheyes_daemon.simulation.airframe.dynamics import STEP_NS, Vehicle
 from morpheyes_daemon.simulation.autopilot_parameters import ParameterTable
 from morpheyes_daemon.simulation.aux_switches import AuxFunction, AuxSwitches, Position
 from morpheyes_daemon.simulation.battery import Battery
@@ -18,7 +19,6 @@ from morpheyes_daemon.simulation.estimator import Estimate, Estimator, Estimator
 from morpheyes_daemon.simulation.flight_control import FlightControl
 from morpheyes_daemon.simulation.flight_modes import FlightSettings, Mode
 from morpheyes_daemon.simulation.radio import PilotInput, Radio, RcInput
-from morpheyes_daemon.simulation.vehicle import STEP_NS, Vehicle
 
 TICK_NS = 10 * MS
 _STEPS = TICK_NS // STEP_NS

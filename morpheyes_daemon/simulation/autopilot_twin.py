@@ -14,6 +14,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import MS, Clock, S, Ticker
+from morpheyes_daemon.simulation.airframe.dynamics import Truth, Vehicle
 from morpheyes_daemon.simulation.autopilot_commands import Commands
 from morpheyes_daemon.simulation.autopilot_core import TICK_NS, Autopilot, Severity
 from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED, ParameterTable
@@ -21,7 +22,6 @@ from morpheyes_daemon.simulation.autopilot_port import AutopilotPort, ByteLink
 from morpheyes_daemon.simulation.estimator import EstimatorNoise
 from morpheyes_daemon.simulation.flight_modes import Mode
 from morpheyes_daemon.simulation.radio import Radio
-from morpheyes_daemon.simulation.vehicle import Truth, Vehicle
 
 _BOOT_NS = 2 * S
 """How long the links are silent after a reboot."""

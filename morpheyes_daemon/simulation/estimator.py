@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from enum import IntFlag
 
 from morpheyes_daemon.clock import S
+from morpheyes_daemon.simulation.airframe.dynamics import Truth, Vehicle
 from morpheyes_daemon.simulation.autopilot_parameters import ParameterTable
-from morpheyes_daemon.simulation.vehicle import Truth, Vehicle
 
 
 class Ekf(IntFlag):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from enum import Enum, auto
 
+from morpheyes_daemon.simulation.airframe.dynamics import STEP_S, Vehicle
 from morpheyes_daemon.simulation.flight_modes import FlightSettings, Mode
 from morpheyes_daemon.simulation.loiter_plant import (
     GRAVITY_M_S2,
@@ -19,7 +20,6 @@ from morpheyes_daemon.simulation.loiter_plant import (
     VelocityReference,
 )
 from morpheyes_daemon.simulation.radio import PilotInput
-from morpheyes_daemon.simulation.vehicle import STEP_S, Vehicle
 
 _BRAKE_ACCEL_M_S2 = 1.6
 _BRAKE_JERK_M_S3 = 1.6

@@ -8,10 +8,10 @@ import time
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import S
+from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
+from morpheyes_daemon.simulation.airframe.wind import WindConditions
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.flight_modes import Mode
-from morpheyes_daemon.simulation.vehicle import Vehicle
-from morpheyes_daemon.simulation.wind import WindConditions
 from tests.hand_clock import HandClock
 
 RATES_HZ = {

@@ -10,13 +10,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from morpheyes_daemon.clock import MS, Clock, S, run_virtual, running_clock
 from morpheyes_daemon.devices.link import MemoryLink
 from morpheyes_daemon.errors import DeviceTimeoutError
+from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
+from morpheyes_daemon.simulation.airframe.wind import WindConditions
 from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.flight_modes import Mode
 from morpheyes_daemon.simulation.ground_crew import GroundCrew
 from morpheyes_daemon.simulation.radio import Radio
-from morpheyes_daemon.simulation.vehicle import Vehicle
-from morpheyes_daemon.simulation.wind import WindConditions
 
 
 class Field:

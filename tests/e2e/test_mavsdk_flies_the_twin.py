@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from morpheyes_daemon.clock import MonotonicClock
+from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.flight_modes import Mode
 from morpheyes_daemon.simulation.mavsdk_crew import MavsdkCrew
 from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.serve_mavlink import MavlinkServer
-from morpheyes_daemon.simulation.vehicle import Vehicle
 
 pytest.importorskip("mavsdk")
 

@@ -24,10 +24,10 @@ from morpheyes_daemon.messages.core import Perception
 from morpheyes_daemon.recorder.reader import Flight, read_flight
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import Action
+from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
 from morpheyes_daemon.simulation.rig_twin import RigTwin
 from morpheyes_daemon.simulation.serve_mavlink import MavlinkServer
-from morpheyes_daemon.simulation.vehicle import Vehicle
 from tests.fixed_rig import fixed_rig
 from tests.real_images import real_images
 

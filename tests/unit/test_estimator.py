@@ -6,9 +6,9 @@ import statistics
 
 import pytest
 
+from morpheyes_daemon.simulation.airframe.dynamics import STEP_S, Airframe, Vehicle
 from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, ParameterTable
 from morpheyes_daemon.simulation.estimator import Ekf, Estimate, Estimator, EstimatorNoise
-from morpheyes_daemon.simulation.vehicle import STEP_S, Airframe, Vehicle
 
 TICK_S = 0.01
 

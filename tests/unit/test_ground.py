@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
+from morpheyes_daemon.simulation.airframe.dynamics import STEP_S, Airframe, Vehicle
 from morpheyes_daemon.simulation.autopilot_parameters import ParameterTable
 from morpheyes_daemon.simulation.estimator import NOISELESS, Estimator
 from morpheyes_daemon.simulation.flight_control import FlightControl
 from morpheyes_daemon.simulation.flight_modes import FlightSettings, Mode
 from morpheyes_daemon.simulation.ground import LEVEL, Ground, Relief, lay
 from morpheyes_daemon.simulation.radio import PilotInput
-from morpheyes_daemon.simulation.vehicle import STEP_S, Airframe, Vehicle
 
 UPHILL = lay(Relief(slope_deg=10.0), seed=0)
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.simulation.airframe.dynamics import STEP_NS, STEP_S, Airframe, Vehicle
+from morpheyes_daemon.simulation.airframe.wind import WindConditions
 from morpheyes_daemon.simulation.loiter_plant import GRAVITY_M_S2
-from morpheyes_daemon.simulation.vehicle import STEP_NS, STEP_S, Airframe, Vehicle
-from morpheyes_daemon.simulation.wind import WindConditions
 
 STILL = Airframe(shiver_rad=0.0)
 

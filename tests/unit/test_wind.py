@@ -5,7 +5,7 @@ import statistics
 
 import pytest
 
-from morpheyes_daemon.simulation.wind import Wind, WindConditions
+from morpheyes_daemon.simulation.airframe.wind import Wind, WindConditions
 
 FT_M = 0.3048
 
