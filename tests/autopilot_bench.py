@@ -11,10 +11,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.simulation.airframe.dynamics import Airframe, Truth, Vehicle
-from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
-from morpheyes_daemon.simulation.estimator import NOISELESS, EstimatorNoise
-from morpheyes_daemon.simulation.flight_modes import Mode
-from morpheyes_daemon.simulation.radio import Radio
+from morpheyes_daemon.simulation.autopilot.ekf import NOISELESS, EstimatorNoise
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.rc_input import Radio
+from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 from tests.hand_clock import HandClock
 
 NEUTRAL = (1500, 1500, 1500, 1500)

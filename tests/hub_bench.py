@@ -18,7 +18,7 @@ from morpheyes_daemon.errors import DeviceNotFoundError
 from morpheyes_daemon.messages.core import Event, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
-from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
+from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 
 DELAY_S = 0.004
 

@@ -37,7 +37,7 @@ from morpheyes_daemon.perception.pipeline import PipelineFactory
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.safety.states import State
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.supervisor.worker import InlineWorker
 
 NEUTRAL_US = (1500, 1500, 1500, 1500)

@@ -11,7 +11,7 @@ from morpheyes_daemon.fault_injection import faults as acts
 from morpheyes_daemon.fault_injection import injectors as sabotage
 from morpheyes_daemon.fault_injection.expectations import Ending, Fault
 from morpheyes_daemon.safety.states import State
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.simulation.teensy_twin import ServoFault
 
 FRAME_S, DEPTH_S, LINK_S, VEHICLE_S, SWITCH_S = 0.6, 0.7, 0.5, 0.3, 0.5

@@ -26,7 +26,7 @@ from morpheyes_daemon.flights.flight_plan import with_seed
 from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.safety.monitor import LOITER
 from morpheyes_daemon.safety.states import HOLDING, State
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 
 WAYS: dict[str, acts.Act] = {"switch": acts.switch_off, "mode": acts.switch_mode(Mode.ALT_HOLD)}
 PER_FLIGHT = 200

@@ -18,11 +18,11 @@ from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.simulation.airframe.dynamics import Truth, Vehicle
 from morpheyes_daemon.simulation.airframe.wind import WindConditions
-from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, RECOMMENDED
-from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
+from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED
+from morpheyes_daemon.simulation.autopilot.rc_input import Radio
+from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
 from morpheyes_daemon.simulation.collision import VehicleShape
-from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.renderer import Renderer
 from morpheyes_daemon.simulation.rig_twin import RigTwin
 from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin

@@ -31,11 +31,11 @@ from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.airframe.dynamics import Truth
-from morpheyes_daemon.simulation.autopilot_core import TICK_NS
+from morpheyes_daemon.simulation.autopilot.core import TICK_NS
+from morpheyes_daemon.simulation.autopilot.rc_input import Radio
+from morpheyes_daemon.simulation.autopilot.tcp_server import MavlinkServer
 from morpheyes_daemon.simulation.frame_server import FrameServer
 from morpheyes_daemon.simulation.pseudo_terminal import PseudoTerminal
-from morpheyes_daemon.simulation.radio import Radio
-from morpheyes_daemon.simulation.serve_mavlink import MavlinkServer
 
 EXPOSURE_LAG_NS = 10 * MS
 """A pose is asked for this long after its moment, so that it lies between two that are known."""

@@ -13,9 +13,9 @@ from collections.abc import AsyncIterator
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.devices.link import Link, OnBytes, open_link
 from morpheyes_daemon.errors import ConfigError, DeviceNotFoundError
-from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED
+from morpheyes_daemon.simulation.autopilot.parameters import RECOMMENDED
+from morpheyes_daemon.simulation.autopilot.rc_input import Radio
 from morpheyes_daemon.simulation.mavsdk_crew import SITL_RC_PORT, MavsdkCrew, RadioOverUdp
-from morpheyes_daemon.simulation.radio import Radio
 from morpheyes_daemon.simulation.sitl_vehicle import SitlVehicle
 
 FIRST_PORT, CREW_PORT, TRUTH_PORT = 5760, 2, 3

@@ -15,9 +15,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import MS, Clock, S
 from morpheyes_daemon.errors import DeviceTimeoutError
-from morpheyes_daemon.simulation.autopilot_port import ByteLink
-from morpheyes_daemon.simulation.flight_modes import Mode
-from morpheyes_daemon.simulation.radio import Radio
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.rc_input import Radio
+from morpheyes_daemon.simulation.autopilot.telemetry_port import ByteLink
 
 GROUND_STATION = (255, 190)
 """System and component id of a usual ground station."""

@@ -27,9 +27,9 @@ from mavsdk.plugins.mavlink_direct import MavlinkMessage
 
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.errors import ConfigError, DeviceNotFoundError, DeviceTimeoutError
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.rc_input import FRAME_NS, Radio
 from morpheyes_daemon.simulation.ground_crew import ORIGIN
-from morpheyes_daemon.simulation.radio import FRAME_NS, Radio
 
 logger = logging.getLogger(__name__)
 

@@ -17,8 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from morpheyes_daemon.clock import MS, Clock, S
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
 from morpheyes_daemon.simulation.airframe.dynamics import Truth
-from morpheyes_daemon.simulation.autopilot_port import ByteLink
-from morpheyes_daemon.simulation.radio import Radio
+from morpheyes_daemon.simulation.autopilot.rc_input import Radio
+from morpheyes_daemon.simulation.autopilot.telemetry_port import ByteLink
 from morpheyes_daemon.transforms import wrap_rad
 
 RATE_HZ = 100.0

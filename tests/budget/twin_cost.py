@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.airframe.wind import WindConditions
-from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 from tests.hand_clock import HandClock
 
 RATES_HZ = {

@@ -14,8 +14,8 @@ from morpheyes_daemon.clock import MS, S, run_virtual, wall_time_s
 from morpheyes_daemon.errors import ConfigError, DeviceError, DeviceTimeoutError
 from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.parameters import RECOMMENDED
 from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride, Decoder, Encoder, Identity, Signing
 from tests.hub_bench import DELAY_S, HubBench
 

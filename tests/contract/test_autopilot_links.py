@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP
-from morpheyes_daemon.simulation.autopilot_telemetry import STREAMS
-from morpheyes_daemon.simulation.estimator import EstimatorNoise
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.ekf import EstimatorNoise
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP
+from morpheyes_daemon.simulation.autopilot.telemetry import STREAMS
 from tests.autopilot_bench import AutopilotBench, Station
 
 REQUEST = mavlink.MAV_CMD_REQUEST_MESSAGE

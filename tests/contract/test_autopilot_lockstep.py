@@ -12,11 +12,11 @@ from morpheyes_daemon.devices.link import MemoryLink
 from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.airframe.wind import WindConditions
-from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, RECOMMENDED
-from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED
+from morpheyes_daemon.simulation.autopilot.rc_input import Radio
+from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 from morpheyes_daemon.simulation.ground_crew import GroundCrew
-from morpheyes_daemon.simulation.radio import Radio
 
 
 class Field:

@@ -15,8 +15,8 @@ from morpheyes_daemon.devices.autopilot.parameters import parameter_file
 from morpheyes_daemon.doctor.findings import Finding, Severity, Verdict, remedies, verdict
 from morpheyes_daemon.doctor.takeover import HandOver, TakeoverTest
 from morpheyes_daemon.doctor.vehicle import VehicleExamination
-from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.parameters import RECOMMENDED
 from tests.hub_bench import HubBench
 from tests.unit.test_doctor_parameters import BAD
 

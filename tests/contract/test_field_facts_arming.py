@@ -5,9 +5,9 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP
-from morpheyes_daemon.simulation.estimator import Ekf
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.ekf import Ekf
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP
 from tests.autopilot_bench import NEUTRAL, AutopilotBench, Station
 
 ARM = mavlink.MAV_CMD_COMPONENT_ARM_DISARM

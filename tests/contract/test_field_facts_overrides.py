@@ -3,7 +3,7 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from tests.autopilot_bench import KEEP, NEUTRAL, AutopilotBench
 
 FORWARD = (1500, 1400, 1500, 1500)

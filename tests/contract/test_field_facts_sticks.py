@@ -5,7 +5,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP
+from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP
 from tests.autopilot_bench import AutopilotBench
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from tests.autopilot_bench import NEUTRAL, AutopilotBench
 
 QUICK = {"LOIT_SPEED": 500, "LOIT_BRK_DELAY": 0.2}

@@ -9,11 +9,11 @@ import pytest
 
 from morpheyes_daemon.clock import MonotonicClock
 from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
-from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.rc_input import Radio
+from morpheyes_daemon.simulation.autopilot.tcp_server import MavlinkServer
+from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 from morpheyes_daemon.simulation.mavsdk_crew import MavsdkCrew
-from morpheyes_daemon.simulation.radio import Radio
-from morpheyes_daemon.simulation.serve_mavlink import MavlinkServer
 
 pytest.importorskip("mavsdk")
 

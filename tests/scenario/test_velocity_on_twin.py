@@ -12,7 +12,7 @@ from morpheyes_daemon.clock import MS, S, Ticker, run_virtual
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.velocity import VelocityController
 from morpheyes_daemon.devices.link import MemoryLink
-from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, RECOMMENDED
+from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.ground_crew import GroundCrew
 from morpheyes_daemon.wire.mavlink import ChannelOverride
 from tests.hub_bench import HubBench

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morpheyes_daemon.simulation.autopilot_parameters import (
+from morpheyes_daemon.simulation.autopilot.parameters import (
     FLOW_SETUP,
     INT16,
     REAL32,

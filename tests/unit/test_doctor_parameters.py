@@ -7,7 +7,7 @@ import pytest
 from morpheyes_daemon.config.vehicle import AutopilotConfig, NoServoConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.doctor.findings import Finding, Severity, Verdict, remedies, verdict
 from morpheyes_daemon.doctor.parameter_rules import RULES, examine_parameters
-from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, RECOMMENDED, ParameterTable
+from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED, ParameterTable
 
 FLOW = {**FLOW_SETUP, "RNGFND1_TYPE": 10}
 

@@ -7,8 +7,8 @@ import statistics
 import pytest
 
 from morpheyes_daemon.simulation.airframe.dynamics import STEP_S, Airframe, Vehicle
-from morpheyes_daemon.simulation.autopilot_parameters import FLOW_SETUP, ParameterTable
-from morpheyes_daemon.simulation.estimator import Ekf, Estimate, Estimator, EstimatorNoise
+from morpheyes_daemon.simulation.autopilot.ekf import Ekf, Estimate, Estimator, EstimatorNoise
+from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, ParameterTable
 
 TICK_S = 0.01
 

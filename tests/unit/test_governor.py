@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from morpheyes_daemon.control.governor import Governor, GovernorLimits, trust_range_m
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.messages.core import DepthSummary, Intent, MissionCommand, VehicleState
-from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED, ParameterTable
+from morpheyes_daemon.simulation.autopilot.parameters import RECOMMENDED, ParameterTable
 
 MODEL = LoiterModel.from_parameters(dict(ParameterTable(RECOMMENDED)))
 LIMITS = GovernorLimits(

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.simulation.airframe.dynamics import STEP_S, Airframe, Vehicle
-from morpheyes_daemon.simulation.autopilot_parameters import ParameterTable
-from morpheyes_daemon.simulation.estimator import NOISELESS, Estimator
-from morpheyes_daemon.simulation.flight_control import FlightControl
-from morpheyes_daemon.simulation.flight_modes import FlightSettings, Mode
+from morpheyes_daemon.simulation.autopilot.ekf import NOISELESS, Estimator
+from morpheyes_daemon.simulation.autopilot.flight_modes import FlightSettings, Mode
+from morpheyes_daemon.simulation.autopilot.mode_controllers import FlightControl
+from morpheyes_daemon.simulation.autopilot.parameters import ParameterTable
+from morpheyes_daemon.simulation.autopilot.rc_input import PilotInput
 from morpheyes_daemon.simulation.ground import LEVEL, Ground, Relief, lay
-from morpheyes_daemon.simulation.radio import PilotInput
 
 UPHILL = lay(Relief(slope_deg=10.0), seed=0)
 

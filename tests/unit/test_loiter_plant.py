@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morpheyes_daemon.simulation.loiter_plant import (
+from morpheyes_daemon.simulation.autopilot.position_controller import (
     GRAVITY_M_S2,
     LoiterLaw,
     LoiterReference,

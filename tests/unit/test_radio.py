@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from morpheyes_daemon.clock import MS, S
-from morpheyes_daemon.simulation.autopilot_parameters import ParameterTable
-from morpheyes_daemon.simulation.radio import KEEP, RELEASE_HIGH, Radio, RcInput
+from morpheyes_daemon.simulation.autopilot.parameters import ParameterTable
+from morpheyes_daemon.simulation.autopilot.rc_input import KEEP, RELEASE_HIGH, Radio, RcInput
 
 TICK = 10 * MS
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.simulation.autopilot_core import Autopilot
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.core import Autopilot
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 
 Message = Any
 """A pymavlink message; the dialect module is untyped."""

@@ -12,13 +12,13 @@ from enum import IntEnum
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.simulation.airframe.dynamics import STEP_NS, Vehicle
-from morpheyes_daemon.simulation.autopilot_parameters import ParameterTable
-from morpheyes_daemon.simulation.aux_switches import AuxFunction, AuxSwitches, Position
-from morpheyes_daemon.simulation.battery import Battery
-from morpheyes_daemon.simulation.estimator import Estimate, Estimator, EstimatorNoise
-from morpheyes_daemon.simulation.flight_control import FlightControl
-from morpheyes_daemon.simulation.flight_modes import FlightSettings, Mode
-from morpheyes_daemon.simulation.radio import PilotInput, Radio, RcInput
+from morpheyes_daemon.simulation.autopilot.aux_switches import AuxFunction, AuxSwitches, Position
+from morpheyes_daemon.simulation.autopilot.battery import Battery
+from morpheyes_daemon.simulation.autopilot.ekf import Estimate, Estimator, EstimatorNoise
+from morpheyes_daemon.simulation.autopilot.flight_modes import FlightSettings, Mode
+from morpheyes_daemon.simulation.autopilot.mode_controllers import FlightControl
+from morpheyes_daemon.simulation.autopilot.parameters import ParameterTable
+from morpheyes_daemon.simulation.autopilot.rc_input import PilotInput, Radio, RcInput
 
 TICK_NS = 10 * MS
 _STEPS = TICK_NS // STEP_NS

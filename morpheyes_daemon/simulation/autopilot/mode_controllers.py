@@ -11,15 +11,15 @@ import math
 from enum import Enum, auto
 
 from morpheyes_daemon.simulation.airframe.dynamics import STEP_S, Vehicle
-from morpheyes_daemon.simulation.flight_modes import FlightSettings, Mode
-from morpheyes_daemon.simulation.loiter_plant import (
+from morpheyes_daemon.simulation.autopilot.flight_modes import FlightSettings, Mode
+from morpheyes_daemon.simulation.autopilot.position_controller import (
     GRAVITY_M_S2,
     LoiterReference,
     Reference,
     Tracking,
     VelocityReference,
 )
-from morpheyes_daemon.simulation.radio import PilotInput
+from morpheyes_daemon.simulation.autopilot.rc_input import PilotInput
 
 _BRAKE_ACCEL_M_S2 = 1.6
 _BRAKE_JERK_M_S3 = 1.6

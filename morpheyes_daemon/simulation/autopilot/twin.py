@@ -15,13 +15,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import MS, Clock, S, Ticker
 from morpheyes_daemon.simulation.airframe.dynamics import Truth, Vehicle
-from morpheyes_daemon.simulation.autopilot_commands import Commands
-from morpheyes_daemon.simulation.autopilot_core import TICK_NS, Autopilot, Severity
-from morpheyes_daemon.simulation.autopilot_parameters import RECOMMENDED, ParameterTable
-from morpheyes_daemon.simulation.autopilot_port import AutopilotPort, ByteLink
-from morpheyes_daemon.simulation.estimator import EstimatorNoise
-from morpheyes_daemon.simulation.flight_modes import Mode
-from morpheyes_daemon.simulation.radio import Radio
+from morpheyes_daemon.simulation.autopilot.commands import Commands
+from morpheyes_daemon.simulation.autopilot.core import TICK_NS, Autopilot, Severity
+from morpheyes_daemon.simulation.autopilot.ekf import EstimatorNoise
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.parameters import RECOMMENDED, ParameterTable
+from morpheyes_daemon.simulation.autopilot.rc_input import Radio
+from morpheyes_daemon.simulation.autopilot.telemetry_port import AutopilotPort, ByteLink
 
 _BOOT_NS = 2 * S
 """How long the links are silent after a reboot."""

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from enum import IntEnum
 
-from morpheyes_daemon.simulation.autopilot_parameters import ParameterTable
-from morpheyes_daemon.simulation.loiter_plant import LoiterLaw
+from morpheyes_daemon.simulation.autopilot.parameters import ParameterTable
+from morpheyes_daemon.simulation.autopilot.position_controller import LoiterLaw
 
 _LOITER_SPEED_LEAST_M_S = 0.2
 

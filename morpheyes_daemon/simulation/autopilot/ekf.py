@@ -13,7 +13,7 @@ from enum import IntFlag
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.simulation.airframe.dynamics import Truth, Vehicle
-from morpheyes_daemon.simulation.autopilot_parameters import ParameterTable
+from morpheyes_daemon.simulation.autopilot.parameters import ParameterTable
 
 
 class Ekf(IntFlag):

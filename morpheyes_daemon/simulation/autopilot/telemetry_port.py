@@ -8,8 +8,8 @@ from typing import Any, Protocol
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.simulation.autopilot_core import Autopilot
-from morpheyes_daemon.simulation.autopilot_telemetry import STREAMS
+from morpheyes_daemon.simulation.autopilot.core import Autopilot
+from morpheyes_daemon.simulation.autopilot.telemetry import STREAMS
 
 _AUTOPILOT_COMPONENT = 1
 _PARAMETERS_PER_TICK = 5

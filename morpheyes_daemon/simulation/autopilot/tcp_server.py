@@ -10,7 +10,7 @@ import asyncio
 from types import TracebackType
 
 from morpheyes_daemon.errors import DeviceNotFoundError
-from morpheyes_daemon.simulation.autopilot_twin import AutopilotTwin
+from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 
 _MOST_BUFFERED = 256 * 1024
 _CHUNK = 4096

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from morpheyes_daemon.simulation.autopilot_parameters import CHANNELS, ParameterTable
+from morpheyes_daemon.simulation.autopilot.parameters import CHANNELS, ParameterTable
 
 _SETTLE_NS = 200_000_000
 _LOW_US, _HIGH_US = 1200, 1800

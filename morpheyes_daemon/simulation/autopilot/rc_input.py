@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from morpheyes_daemon.simulation.autopilot_parameters import CHANNELS, ParameterTable
+from morpheyes_daemon.simulation.autopilot.parameters import CHANNELS, ParameterTable
 
 FRAME_NS = 20_000_000
 """A receiver delivers 50 frames a second."""

@@ -11,9 +11,9 @@ from typing import Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.simulation.autopilot_core import Autopilot
-from morpheyes_daemon.simulation.aux_switches import AuxFunction, Position
-from morpheyes_daemon.simulation.flight_modes import Mode
+from morpheyes_daemon.simulation.autopilot.aux_switches import AuxFunction, Position
+from morpheyes_daemon.simulation.autopilot.core import Autopilot
+from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 
 ACCEPTED = int(mavlink.MAV_RESULT_ACCEPTED)
 DENIED = int(mavlink.MAV_RESULT_DENIED)

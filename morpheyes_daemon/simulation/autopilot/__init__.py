@@ -1,0 +1,1 @@
+"""The autopilot twin: ArduCopter's modes, EKF, RC input and MAVLink telemetry."""
