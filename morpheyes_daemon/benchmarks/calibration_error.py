@@ -27,7 +27,7 @@ from morpheyes_daemon.calibration.targets.image_pairs import read_folder
 from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.flights.sim_boards import twin_from_name
-from morpheyes_daemon.simulation.rig_twin import RANGE_M, RigTwin
+from morpheyes_daemon.simulation.camera.true_rig import RANGE_M, RigTwin
 from morpheyes_daemon.stereo.rectify import homogeneous
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import Array

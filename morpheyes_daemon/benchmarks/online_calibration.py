@@ -21,9 +21,9 @@ from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame, Vehicl
 from morpheyes_daemon.perception.camera_motion import EyeMotion, eye_motion
 from morpheyes_daemon.perception.extrinsics_monitor import DriftLimits, DriftMonitor, DriftReport
 from morpheyes_daemon.perception.yaw_estimator import STILL, Uncertain
-from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
+from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin, T_frd_rig
 from morpheyes_daemon.simulation.renderer import Renderer
-from morpheyes_daemon.simulation.rig_twin import RigTwin, T_frd_rig
 from morpheyes_daemon.simulation.worlds import build_world, load_world
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
 from morpheyes_daemon.stereo.epipolar import row_offsets

@@ -112,7 +112,7 @@ def calibration_file(kind: str, progress: Progress = silent) -> Path:
     if kind == "mounted":
         return mounted_rig_file(0, progress=progress)
     if kind == "exact":
-        from morpheyes_daemon.simulation.rig_twin import RigTwin
+        from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 
         path = cache_folder("calibration") / "exact.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)

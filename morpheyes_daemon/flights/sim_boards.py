@@ -24,8 +24,8 @@ from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.simulation.autopilot.ekf import EstimatorNoise
-from morpheyes_daemon.simulation.board_twin import BoardTwin
-from morpheyes_daemon.simulation.rig_twin import RANGE_M, RigTwin
+from morpheyes_daemon.simulation.camera.calibration_boards import BoardTwin
+from morpheyes_daemon.simulation.camera.true_rig import RANGE_M, RigTwin
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.transforms import Array, R_from_rpy, rpy_from_R
 

@@ -21,10 +21,10 @@ from morpheyes_daemon.simulation.airframe.wind import WindConditions
 from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.autopilot.rc_input import Radio
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
-from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
+from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.simulation.collision import VehicleShape
 from morpheyes_daemon.simulation.renderer import Renderer
-from morpheyes_daemon.simulation.rig_twin import RigTwin
 from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
 from morpheyes_daemon.simulation.worlds import World, build_world, load_world
 

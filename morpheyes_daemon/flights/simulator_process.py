@@ -34,7 +34,7 @@ from morpheyes_daemon.simulation.airframe.dynamics import Truth
 from morpheyes_daemon.simulation.autopilot.core import TICK_NS
 from morpheyes_daemon.simulation.autopilot.rc_input import Radio
 from morpheyes_daemon.simulation.autopilot.tcp_server import MavlinkServer
-from morpheyes_daemon.simulation.frame_server import FrameServer
+from morpheyes_daemon.simulation.camera.frame_server import FrameServer
 from morpheyes_daemon.simulation.pseudo_terminal import PseudoTerminal
 
 EXPOSURE_LAG_NS = 10 * MS

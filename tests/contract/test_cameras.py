@@ -29,7 +29,7 @@ from morpheyes_daemon.errors import (
     InputError,
 )
 from morpheyes_daemon.messages.core import Image, RawPair
-from morpheyes_daemon.simulation.frame_server import FrameServer
+from morpheyes_daemon.simulation.camera.frame_server import FrameServer
 from tests.hand_clock import HandClock
 from tests.real_images import real_images
 

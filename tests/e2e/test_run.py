@@ -27,7 +27,7 @@ from morpheyes_daemon.safety.states import Action
 from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.autopilot.tcp_server import MavlinkServer
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
-from morpheyes_daemon.simulation.rig_twin import RigTwin
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from tests.fixed_rig import fixed_rig
 from tests.real_images import real_images
 

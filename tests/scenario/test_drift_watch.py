@@ -3,7 +3,7 @@
 import pytest
 
 from morpheyes_daemon.benchmarks.online_calibration import FRAMES, drift_trial, late_trials
-from morpheyes_daemon.simulation.rig_twin import RigTwin
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 
 pytestmark = pytest.mark.slow
 

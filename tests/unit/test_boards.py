@@ -6,8 +6,8 @@ import pytest
 from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners, parse_board
 from morpheyes_daemon.calibration.targets.subpixel import saddle_points
 from morpheyes_daemon.errors import UsageError
-from morpheyes_daemon.simulation.board_twin import BoardTwin, draw_poses
-from morpheyes_daemon.simulation.rig_twin import RigTwin
+from morpheyes_daemon.simulation.camera.calibration_boards import BoardTwin, draw_poses
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.transforms import inverse
 
 CHESS = Board(9, 6, 0.025)

@@ -11,7 +11,7 @@ import yaml
 
 from morpheyes_daemon.cli import main
 from morpheyes_daemon.flights.sim_boards import render_folder
-from morpheyes_daemon.simulation.rig_twin import RigTwin
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.stereo.rig import RigModel
 
 NOMINAL_M = (0.1, 0.2, 0.3)

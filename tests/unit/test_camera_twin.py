@@ -11,10 +11,10 @@ import pytest
 
 from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.messages.core import FloatMap, Image
-from morpheyes_daemon.simulation.camera_twin import CameraTwin, Sensor
+from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
+from morpheyes_daemon.simulation.camera.true_rig import RigErrors, RigTwin
 from morpheyes_daemon.simulation.forest import ForestWorld
 from morpheyes_daemon.simulation.renderer import Renderer
-from morpheyes_daemon.simulation.rig_twin import RigErrors, RigTwin
 from morpheyes_daemon.simulation.scene import Light, Material, Mesh, Scene
 from morpheyes_daemon.simulation.textures import finished
 from morpheyes_daemon.simulation.worlds import WorldFile, build_world

@@ -11,8 +11,8 @@ from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.rig_capture.board_capture import Scene, capture_boards, capture_visits
-from morpheyes_daemon.simulation.board_twin import BoardTwin
-from morpheyes_daemon.simulation.rig_twin import RigTwin
+from morpheyes_daemon.simulation.camera.calibration_boards import BoardTwin
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 
 BOARD = Board(5, 4, 0.04)
 

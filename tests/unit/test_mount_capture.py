@@ -15,8 +15,8 @@ from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import RawPair, VehicleState
 from morpheyes_daemon.rig_capture.mount_capture import capture_mount
-from morpheyes_daemon.simulation.board_twin import BoardTwin
-from morpheyes_daemon.simulation.rig_twin import RigTwin
+from morpheyes_daemon.simulation.camera.calibration_boards import BoardTwin
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.transforms import Array, R_from_rpy, rpy_from_R
 
 BOARD = Board(5, 4, 0.04)

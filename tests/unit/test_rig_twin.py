@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morpheyes_daemon.simulation.rig_twin import RANGE_M, RigErrors, RigTwin
+from morpheyes_daemon.simulation.camera.true_rig import RANGE_M, RigErrors, RigTwin
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import inverse, q_from_R
 

@@ -103,7 +103,7 @@ def render(
         render_folder,
         render_mount_folder,
     )
-    from morpheyes_daemon.simulation.rig_twin import RANGE_M
+    from morpheyes_daemon.simulation.camera.true_rig import RANGE_M
 
     usual = {"board": DEFAULT_BOARD.label, "square_mm": 25.0}
     chosen = choose_board(usual, board, square_mm, marker_mm, checked=False)

@@ -18,9 +18,9 @@ import numpy as np
 
 from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole, RawPair, frozen
-from morpheyes_daemon.simulation.develop import NOISE, develop
+from morpheyes_daemon.simulation.camera.sensor import NOISE, develop
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin, T_frd_rig
 from morpheyes_daemon.simulation.renderer import Rendered, Renderer
-from morpheyes_daemon.simulation.rig_twin import RigTwin, T_frd_rig
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.transforms import Array
 

@@ -1,0 +1,1 @@
+"""The stereo camera twin: true rig, sensor, calibration boards."""
