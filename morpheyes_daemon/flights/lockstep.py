@@ -35,7 +35,7 @@ from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.perception.pipeline import PipelineFactory
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import State
-from morpheyes_daemon.simulation.ground_crew import GroundCrew
+from morpheyes_daemon.simulation.crew.scripted import GroundCrew
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.supervisor.worker import InlineWorker
 

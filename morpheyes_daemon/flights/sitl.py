@@ -15,8 +15,8 @@ from morpheyes_daemon.devices.link import Link, OnBytes, open_link
 from morpheyes_daemon.errors import ConfigError, DeviceNotFoundError
 from morpheyes_daemon.simulation.autopilot.parameters import RECOMMENDED
 from morpheyes_daemon.simulation.autopilot.rc_input import Radio
-from morpheyes_daemon.simulation.mavsdk_crew import SITL_RC_PORT, MavsdkCrew, RadioOverUdp
-from morpheyes_daemon.simulation.sitl_vehicle import SitlVehicle
+from morpheyes_daemon.simulation.crew.mavsdk import SITL_RC_PORT, MavsdkCrew, RadioOverUdp
+from morpheyes_daemon.simulation.crew.sitl_vehicle import SitlVehicle
 
 FIRST_PORT, CREW_PORT, TRUTH_PORT = 5760, 2, 3
 """SITL's serial0 is tcp 5760 (plus 10 per instance); serial1 and serial2 are two and three above."""

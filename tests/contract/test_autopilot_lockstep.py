@@ -16,7 +16,7 @@ from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.autopilot.rc_input import Radio
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
-from morpheyes_daemon.simulation.ground_crew import GroundCrew
+from morpheyes_daemon.simulation.crew.scripted import GroundCrew
 
 
 class Field:

@@ -13,7 +13,7 @@ from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.simulation.autopilot.rc_input import Radio
 from morpheyes_daemon.simulation.autopilot.tcp_server import MavlinkServer
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
-from morpheyes_daemon.simulation.mavsdk_crew import MavsdkCrew
+from morpheyes_daemon.simulation.crew.mavsdk import MavsdkCrew
 
 pytest.importorskip("mavsdk")
 

@@ -13,7 +13,7 @@ from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.velocity import VelocityController
 from morpheyes_daemon.devices.link import MemoryLink
 from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED
-from morpheyes_daemon.simulation.ground_crew import GroundCrew
+from morpheyes_daemon.simulation.crew.scripted import GroundCrew
 from morpheyes_daemon.wire.mavlink import ChannelOverride
 from tests.hub_bench import HubBench
 

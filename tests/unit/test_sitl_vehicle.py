@@ -13,7 +13,7 @@ from morpheyes_daemon.errors import DeviceTimeoutError, InputError
 from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.simulation.autopilot.rc_input import Radio
-from morpheyes_daemon.simulation.sitl_vehicle import AHEAD_NS, KEPT, SitlVehicle
+from morpheyes_daemon.simulation.crew.sitl_vehicle import AHEAD_NS, KEPT, SitlVehicle
 from tests.hand_clock import HandClock
 
 LAT, LON, ALT = -353632620, 1491652370, 584.0

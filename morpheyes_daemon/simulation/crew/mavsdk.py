@@ -29,7 +29,7 @@ from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.errors import ConfigError, DeviceNotFoundError, DeviceTimeoutError
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.simulation.autopilot.rc_input import FRAME_NS, Radio
-from morpheyes_daemon.simulation.ground_crew import ORIGIN
+from morpheyes_daemon.simulation.crew.scripted import ORIGIN
 
 logger = logging.getLogger(__name__)
 

@@ -1,0 +1,1 @@
+"""The ground crew of simulated and SITL flights: arm, take off, switch, land."""
