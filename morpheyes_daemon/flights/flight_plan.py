@@ -105,7 +105,7 @@ def usual_calibration(strategy: str) -> str:
 def calibration_file(kind: str, progress: Progress = silent) -> Path:
     """Return the calibration file to fly with: solved or mounted (made once and kept), exact, or a path."""
     from morpheyes_daemon.flights.sim_calibration import mounted_rig_file, solved_rig_file
-    from morpheyes_daemon.simulation.kept import cache_folder
+    from morpheyes_daemon.simulation.rendering.texture_cache import cache_folder
 
     if kind == "solved":
         return solved_rig_file(0, progress=progress)

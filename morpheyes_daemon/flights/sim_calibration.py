@@ -13,7 +13,7 @@ from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.flights.sim_boards import DEFAULT_BOARD, observe_mount, observe_twin, twin_name
 from morpheyes_daemon.simulation.camera.true_rig import T_frd_rig
-from morpheyes_daemon.simulation.kept import cache_folder
+from morpheyes_daemon.simulation.rendering.texture_cache import cache_folder
 from morpheyes_daemon.stereo.rig import RigModel
 
 _SIZE = (640, 480)

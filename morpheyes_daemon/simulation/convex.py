@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.simulation.kernel import allocating
+from morpheyes_daemon.simulation.rendering.jit import allocating
 
 FRUSTUM, CYLINDER, ELLIPSOID, BOX, PRISM = range(5)
 """Kinds of solid; what `size` (9,) means in the solid's own frame, centred at the origin:

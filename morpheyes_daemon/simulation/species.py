@@ -13,8 +13,8 @@ from functools import cache
 
 import numpy as np
 
-from morpheyes_daemon.simulation import meshes
-from morpheyes_daemon.simulation.meshes import Surface
+from morpheyes_daemon.simulation.rendering import meshes
+from morpheyes_daemon.simulation.rendering.meshes import Surface
 from morpheyes_daemon.transforms import Array
 
 CONIFERS, BROADLEAVES, BUSHES = 6, 10, 6

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.simulation import meshes
 from morpheyes_daemon.simulation.collision import Solid, ellipsoid_solid, frustum_solid
 from morpheyes_daemon.simulation.contents import Disc
-from morpheyes_daemon.simulation.scene import Bgr, Light, Mesh
+from morpheyes_daemon.simulation.rendering import meshes
+from morpheyes_daemon.simulation.rendering.scene import Bgr, Light, Mesh
 from morpheyes_daemon.simulation.species import Layer, Species
 from morpheyes_daemon.transforms import Array
 

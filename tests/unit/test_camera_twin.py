@@ -14,9 +14,9 @@ from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
 from morpheyes_daemon.simulation.camera.true_rig import RigErrors, RigTwin
 from morpheyes_daemon.simulation.forest import ForestWorld
-from morpheyes_daemon.simulation.renderer import Renderer
-from morpheyes_daemon.simulation.scene import Light, Material, Mesh, Scene
-from morpheyes_daemon.simulation.textures import finished
+from morpheyes_daemon.simulation.rendering.renderer import Renderer
+from morpheyes_daemon.simulation.rendering.scene import Light, Material, Mesh, Scene
+from morpheyes_daemon.simulation.rendering.textures import finished
 from morpheyes_daemon.simulation.worlds import WorldFile, build_world
 from morpheyes_daemon.transforms import Array, R_from_rpy, inverse, pose
 

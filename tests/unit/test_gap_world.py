@@ -18,7 +18,7 @@ from morpheyes_daemon.simulation.collision import VehicleShape
 from morpheyes_daemon.simulation.gap import GapWorld, Opening
 from morpheyes_daemon.simulation.motion import Motion, along_waypoints, swaying
 from morpheyes_daemon.simulation.openings import Shape, outline
-from morpheyes_daemon.simulation.renderer import Renderer
+from morpheyes_daemon.simulation.rendering.renderer import Renderer
 from morpheyes_daemon.simulation.wall import Wall
 from morpheyes_daemon.simulation.worlds import WorldFile, build_world
 from morpheyes_daemon.transforms import R_FRD_CAM, Array, R_from_rpy, inverse, pose

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from morpheyes_daemon.simulation.kept import kept_texture
-from morpheyes_daemon.simulation.textures import Texture
+from morpheyes_daemon.simulation.rendering.texture_cache import kept_texture
+from morpheyes_daemon.simulation.rendering.textures import Texture
 
 
 class Maker:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.simulation.kernel import inlined, kernel
+from morpheyes_daemon.simulation.rendering.jit import inlined, kernel
 
 NOISE: NDArray[np.float32] = np.random.default_rng(4711).standard_normal(1 << 18, dtype=np.float32)
 """Unit normal numbers; a power of two of them."""

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages.core import FloatMap, Pinhole
-from morpheyes_daemon.simulation.scene import Light, Material, Mesh, Scene
-from morpheyes_daemon.simulation.textures import Texture
+from morpheyes_daemon.simulation.rendering.scene import Light, Material, Mesh, Scene
+from morpheyes_daemon.simulation.rendering.textures import Texture
 from morpheyes_daemon.transforms import Array
 
 VARIANT = "scalar_rgb"

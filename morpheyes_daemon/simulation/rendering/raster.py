@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.simulation.kernel import allocating, inlined, kernel
+from morpheyes_daemon.simulation.rendering.jit import allocating, inlined, kernel
 
 NEAR_M = 0.05
 

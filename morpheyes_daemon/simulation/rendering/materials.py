@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 
-from morpheyes_daemon.simulation import textures
-from morpheyes_daemon.simulation.kept import kept_texture
-from morpheyes_daemon.simulation.scene import Material, Mesh
-from morpheyes_daemon.simulation.textures import Texture
+from morpheyes_daemon.simulation.rendering import textures
+from morpheyes_daemon.simulation.rendering.scene import Material, Mesh
+from morpheyes_daemon.simulation.rendering.texture_cache import kept_texture
+from morpheyes_daemon.simulation.rendering.textures import Texture
 
 TEXTURES: Mapping[str, Callable[[], Texture]] = {
     "bark0": lambda: textures.bark(0),

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.simulation.textures import Texture
+from morpheyes_daemon.simulation.rendering.textures import Texture
 
 Array = NDArray[np.float64]
 Bgr = tuple[float, float, float]

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.simulation.kernel import inlined, kernel
-from morpheyes_daemon.simulation.raster import COUNT
+from morpheyes_daemon.simulation.rendering.jit import inlined, kernel
+from morpheyes_daemon.simulation.rendering.raster import COUNT
 
 MAX_TAPS = 3
 """Most texture taps along the longer axis of a pixel's footprint."""

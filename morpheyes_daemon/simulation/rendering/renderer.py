@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole
-from morpheyes_daemon.simulation.raster import COUNT, PLANES, SAMPLES, TILE, rasterise, visible_parts
-from morpheyes_daemon.simulation.scene import SKY_OBJECT, Material, Mesh, Scene
-from morpheyes_daemon.simulation.shading import shade_image
-from morpheyes_daemon.simulation.textures import Atlas, pack
+from morpheyes_daemon.simulation.rendering.raster import COUNT, PLANES, SAMPLES, TILE, rasterise, visible_parts
+from morpheyes_daemon.simulation.rendering.scene import SKY_OBJECT, Material, Mesh, Scene
+from morpheyes_daemon.simulation.rendering.shading import shade_image
+from morpheyes_daemon.simulation.rendering.textures import Atlas, pack
 from morpheyes_daemon.transforms import Array, inverse, pose
 
 

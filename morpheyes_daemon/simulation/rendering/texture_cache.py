@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.simulation import textures
-from morpheyes_daemon.simulation.textures import Texture
+from morpheyes_daemon.simulation.rendering import textures
+from morpheyes_daemon.simulation.rendering.textures import Texture
 
 
 def cache_folder(name: str) -> Path:

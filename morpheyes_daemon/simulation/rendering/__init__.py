@@ -1,0 +1,1 @@
+"""The renderer: scene, meshes, textures, rasterizer, shading."""
