@@ -20,7 +20,7 @@ from morpheyes_daemon.fault_injection.harness import FaultFlight
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
-from morpheyes_daemon.simulation.teensy_twin import ServoFault
+from morpheyes_daemon.simulation.servo.teensy import ServoFault
 from morpheyes_daemon.supervisor.worker import WorkerFailed, WorkerLost
 
 Act = Callable[[FaultFlight], None]

@@ -12,7 +12,7 @@ from morpheyes_daemon.fault_injection import injectors as sabotage
 from morpheyes_daemon.fault_injection.expectations import Ending, Fault
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
-from morpheyes_daemon.simulation.teensy_twin import ServoFault
+from morpheyes_daemon.simulation.servo.teensy import ServoFault
 
 FRAME_S, DEPTH_S, LINK_S, VEHICLE_S, SWITCH_S = 0.6, 0.7, 0.5, 0.3, 0.5
 """Declared times to notice: three camera periods, the same and the matcher's latency, and the time-outs."""

@@ -25,7 +25,7 @@ from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.simulation.collision import VehicleShape
 from morpheyes_daemon.simulation.rendering.renderer import Renderer
-from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
+from morpheyes_daemon.simulation.servo.teensy import ServoTruth, TeensyTwin
 from morpheyes_daemon.simulation.worlds import World, build_world, load_world
 
 READOUT_NS = 10 * MS

@@ -35,7 +35,7 @@ from morpheyes_daemon.simulation.autopilot.core import TICK_NS
 from morpheyes_daemon.simulation.autopilot.rc_input import Radio
 from morpheyes_daemon.simulation.autopilot.tcp_server import MavlinkServer
 from morpheyes_daemon.simulation.camera.frame_server import FrameServer
-from morpheyes_daemon.simulation.pseudo_terminal import PseudoTerminal
+from morpheyes_daemon.simulation.servo.pty import PseudoTerminal
 
 EXPOSURE_LAG_NS = 10 * MS
 """A pose is asked for this long after its moment, so that it lies between two that are known."""

@@ -19,7 +19,7 @@ from morpheyes_daemon.devices.servo.teensy import SerialServo
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.simulation.teensy_twin import ServoFault, ServoTruth, TeensyTwin
+from morpheyes_daemon.simulation.servo.teensy import ServoFault, ServoTruth, TeensyTwin
 
 MOTION = ServoMotion()
 

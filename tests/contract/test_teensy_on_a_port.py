@@ -14,8 +14,8 @@ from morpheyes_daemon.devices.link import open_link
 from morpheyes_daemon.devices.servo.teensy import SerialServo
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.simulation.pseudo_terminal import PseudoTerminal
-from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
+from morpheyes_daemon.simulation.servo.pty import PseudoTerminal
+from morpheyes_daemon.simulation.servo.teensy import ServoTruth, TeensyTwin
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals here")
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.config.vehicle import NoServoConfig, SerialServoConfig, ServoMotion
 from morpheyes_daemon.control.baseline import HISTORY_NS, BaselineModel, FixedBaseline, baseline_for, baseline_model
-from morpheyes_daemon.simulation.teensy_twin import ServoFault, ServoTruth, TeensyTwin
+from morpheyes_daemon.simulation.servo.teensy import ServoFault, ServoTruth, TeensyTwin
 from morpheyes_daemon.wire.servo import SetTarget, encode
 from tests.hand_clock import HandClock
 

@@ -11,7 +11,7 @@ from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.control.baseline import SPEED_TOLERANCE, BaselineModel
 from morpheyes_daemon.control.baseline_planner import TURN_SIGMA_M, WINDOW_NS, BaselinePlanner
-from morpheyes_daemon.simulation.teensy_twin import ServoTruth, TeensyTwin
+from morpheyes_daemon.simulation.servo.teensy import ServoTruth, TeensyTwin
 from morpheyes_daemon.wire.servo import SetTarget, encode
 from tests.hand_clock import HandClock
 

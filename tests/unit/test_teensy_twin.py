@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.clock import MS, S, run_virtual, running_clock
-from morpheyes_daemon.simulation.teensy_twin import ServoFault, ServoTruth, TeensyTwin
+from morpheyes_daemon.simulation.servo.teensy import ServoFault, ServoTruth, TeensyTwin
 from morpheyes_daemon.wire.servo import Ack, Decoder, Hello, SetTarget, Status, StatusFlag, Verdict, encode
 from tests.hand_clock import HandClock
 

@@ -1,0 +1,1 @@
+"""The Teensy twin and its pseudo-terminal."""
