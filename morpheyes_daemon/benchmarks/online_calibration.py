@@ -24,7 +24,7 @@ from morpheyes_daemon.perception.yaw_estimator import STILL, Uncertain
 from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin, T_frd_rig
 from morpheyes_daemon.simulation.rendering.renderer import Renderer
-from morpheyes_daemon.simulation.worlds import build_world, load_world
+from morpheyes_daemon.simulation.worlds.loader import build_world, load_world
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
 from morpheyes_daemon.stereo.epipolar import row_offsets
 from morpheyes_daemon.stereo.rig import RigModel

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.messages.core import FloatMap, Pinhole
-from morpheyes_daemon.simulation.contents import GapTruth
+from morpheyes_daemon.simulation.worlds.world import GapTruth
 from morpheyes_daemon.stereo.rectify import Rectification
 from morpheyes_daemon.strategies.wall import Mask
 from morpheyes_daemon.transforms import Array, inverse

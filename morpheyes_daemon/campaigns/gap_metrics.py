@@ -17,8 +17,8 @@ from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages.core import Perception, StereoFrame
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import State
-from morpheyes_daemon.simulation.gap import GapWorld, drawn_shape
-from morpheyes_daemon.simulation.worlds import load_world
+from morpheyes_daemon.simulation.worlds.gap_world import GapWorld, drawn_shape
+from morpheyes_daemon.simulation.worlds.loader import load_world
 from morpheyes_daemon.stereo.rectify import Rectifier
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.gap_percept import GapPercept

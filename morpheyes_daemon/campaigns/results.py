@@ -15,9 +15,9 @@ from morpheyes_daemon.campaigns.forest_table import Row, flight_cells, flight_ta
 from morpheyes_daemon.campaigns.gap_table import gap_cells, gap_table
 from morpheyes_daemon.campaigns.imo_table import draw_trajectories, imo_cells, imo_table
 from morpheyes_daemon.flights.lockstep import FlightPlan
-from morpheyes_daemon.simulation.forest import ForestWorld
-from morpheyes_daemon.simulation.gap import GapWorld
-from morpheyes_daemon.simulation.worlds import MixedWorld, load_world
+from morpheyes_daemon.simulation.worlds.forest_world import ForestWorld
+from morpheyes_daemon.simulation.worlds.gap_world import GapWorld
+from morpheyes_daemon.simulation.worlds.loader import MixedWorld, load_world
 
 SETTINGS, RESULTS, TABLE = "campaign.json", "results.json", "table.md"
 

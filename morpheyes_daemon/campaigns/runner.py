@@ -24,7 +24,7 @@ from morpheyes_daemon.errors import InputError, MorphEyesError, UsageError, mist
 from morpheyes_daemon.flights.artifacts import FlightOutputs
 from morpheyes_daemon.flights.flight_plan import hold, parse_baseline, with_seed
 from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
-from morpheyes_daemon.simulation.worlds import load_world
+from morpheyes_daemon.simulation.worlds.loader import load_world
 from morpheyes_daemon.stereo.rig import RigModel
 
 FLIGHTS = "flights.jsonl"

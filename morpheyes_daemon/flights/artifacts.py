@@ -20,8 +20,8 @@ from morpheyes_daemon.recorder.pictures.scene import Disc, Polygon, Scene
 from morpheyes_daemon.recorder.pictures.strips import draw_strips
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.series import FlightSeries
-from morpheyes_daemon.simulation.contents import GapTruth
-from morpheyes_daemon.simulation.worlds import World
+from morpheyes_daemon.simulation.worlds.loader import World
+from morpheyes_daemon.simulation.worlds.world import GapTruth
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import inverse
 

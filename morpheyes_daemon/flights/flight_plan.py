@@ -13,7 +13,7 @@ from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.flights.lockstep import FlightPlan, sim_config
 from morpheyes_daemon.flights.sim_vehicle import Scenario
 from morpheyes_daemon.perception.pipeline import fitting_rig
-from morpheyes_daemon.simulation.worlds import load_world
+from morpheyes_daemon.simulation.worlds.loader import load_world
 
 DISPARITIES_OF_PX = 640
 """Width of the images that a number of disparities is said for; smaller images search in proportion."""

@@ -23,10 +23,10 @@ from morpheyes_daemon.simulation.autopilot.rc_input import Radio
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
-from morpheyes_daemon.simulation.collision import VehicleShape
 from morpheyes_daemon.simulation.rendering.renderer import Renderer
 from morpheyes_daemon.simulation.servo.teensy import ServoTruth, TeensyTwin
-from morpheyes_daemon.simulation.worlds import World, build_world, load_world
+from morpheyes_daemon.simulation.worlds.collision import VehicleShape
+from morpheyes_daemon.simulation.worlds.loader import World, build_world, load_world
 
 READOUT_NS = 10 * MS
 """From mid-exposure of the later eye to the daemon having the pair."""

@@ -17,7 +17,7 @@ import numpy as np
 from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole
 from morpheyes_daemon.simulation.rendering.mitsuba import trace
 from morpheyes_daemon.simulation.rendering.renderer import Renderer, encode
-from morpheyes_daemon.simulation.worlds import build_world, load_world
+from morpheyes_daemon.simulation.worlds.loader import build_world, load_world
 from morpheyes_daemon.stereo.colours import colour_depth
 from morpheyes_daemon.stereo.depth import default_settings, depth_from_disparity, grey
 from morpheyes_daemon.stereo.matching import disparity_range, match

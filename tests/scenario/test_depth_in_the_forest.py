@@ -14,7 +14,7 @@ from morpheyes_daemon.perception.image_checks import exposure_faults, matching_f
 from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.simulation.rendering.renderer import Renderer
-from morpheyes_daemon.simulation.worlds import build_world, load_world
+from morpheyes_daemon.simulation.worlds.loader import build_world, load_world
 from morpheyes_daemon.stereo.depth import DepthEstimator, depth_sigma
 from morpheyes_daemon.stereo.rectify import rays
 from morpheyes_daemon.transforms import R_from_rpy, pose

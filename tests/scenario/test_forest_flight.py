@@ -8,8 +8,8 @@ import pytest
 from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import Action, State
-from morpheyes_daemon.simulation.collision import VehicleShape
-from morpheyes_daemon.simulation.worlds import build_world, load_world
+from morpheyes_daemon.simulation.worlds.collision import VehicleShape
+from morpheyes_daemon.simulation.worlds.loader import build_world, load_world
 
 Maker = Callable[..., FlightPlan]
 

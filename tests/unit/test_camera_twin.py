@@ -13,11 +13,11 @@ from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
 from morpheyes_daemon.simulation.camera.true_rig import RigErrors, RigTwin
-from morpheyes_daemon.simulation.forest import ForestWorld
 from morpheyes_daemon.simulation.rendering.renderer import Renderer
 from morpheyes_daemon.simulation.rendering.scene import Light, Material, Mesh, Scene
 from morpheyes_daemon.simulation.rendering.textures import finished
-from morpheyes_daemon.simulation.worlds import WorldFile, build_world
+from morpheyes_daemon.simulation.worlds.forest_world import ForestWorld
+from morpheyes_daemon.simulation.worlds.loader import WorldFile, build_world
 from morpheyes_daemon.transforms import Array, R_from_rpy, inverse, pose
 
 STILL = pose(R_from_rpy(0.03, -0.05, 0.1), np.array([0.0, 0.0, -1.5]))

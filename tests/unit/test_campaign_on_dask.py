@@ -67,7 +67,7 @@ def test_the_only_worker_flies_with_our_calibration_and_world_in_files_of_its_ow
     def fly_one(plan: Any, key: str, folder: Any = None) -> Row:
         import os
 
-        from morpheyes_daemon.simulation.worlds import load_world
+        from morpheyes_daemon.simulation.worlds.loader import load_world
 
         world: Any = load_world(plan.scenario.world).world
         return {

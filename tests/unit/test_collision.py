@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from morpheyes_daemon.config.vehicle import Footprint, Mount
-from morpheyes_daemon.simulation.collision import (
+from morpheyes_daemon.simulation.worlds.collision import (
     CollisionWorld,
     MovingObstacles,
     Obstacles,
@@ -21,7 +21,7 @@ from morpheyes_daemon.simulation.collision import (
     frustum_solid,
     prism_solid,
 )
-from morpheyes_daemon.simulation.convex import BOX, ELLIPSOID, FRUSTUM, PRISM
+from morpheyes_daemon.simulation.worlds.gjk import BOX, ELLIPSOID, FRUSTUM, PRISM
 from morpheyes_daemon.transforms import Array, R_from_rotvec, R_from_rpy, pose
 
 LEVEL = np.eye(3)

@@ -14,13 +14,13 @@ from morpheyes_daemon.config.vehicle import Footprint, Mount
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.flights.artifacts import wall_plan
 from morpheyes_daemon.messages.core import Pinhole
-from morpheyes_daemon.simulation.collision import VehicleShape
-from morpheyes_daemon.simulation.gap import GapWorld, Opening
-from morpheyes_daemon.simulation.motion import Motion, along_waypoints, swaying
-from morpheyes_daemon.simulation.openings import Shape, outline
 from morpheyes_daemon.simulation.rendering.renderer import Renderer
-from morpheyes_daemon.simulation.wall import Wall
-from morpheyes_daemon.simulation.worlds import WorldFile, build_world
+from morpheyes_daemon.simulation.worlds.collision import VehicleShape
+from morpheyes_daemon.simulation.worlds.gap_world import GapWorld, Opening
+from morpheyes_daemon.simulation.worlds.loader import WorldFile, build_world
+from morpheyes_daemon.simulation.worlds.openings import Shape, outline
+from morpheyes_daemon.simulation.worlds.trajectories import Motion, along_waypoints, swaying
+from morpheyes_daemon.simulation.worlds.wall_geometry import Wall
 from morpheyes_daemon.transforms import R_FRD_CAM, Array, R_from_rpy, inverse, pose
 
 SHAPES: tuple[Shape, ...] = ("rectangle", "infinity", "goku", "blob")

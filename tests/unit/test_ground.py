@@ -13,7 +13,7 @@ from morpheyes_daemon.simulation.autopilot.flight_modes import FlightSettings, M
 from morpheyes_daemon.simulation.autopilot.mode_controllers import FlightControl
 from morpheyes_daemon.simulation.autopilot.parameters import ParameterTable
 from morpheyes_daemon.simulation.autopilot.rc_input import PilotInput
-from morpheyes_daemon.simulation.ground import LEVEL, Ground, Relief, lay
+from morpheyes_daemon.simulation.worlds.ground import LEVEL, Ground, Relief, lay
 
 UPHILL = lay(Relief(slope_deg=10.0), seed=0)
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.messages.core import Pinhole
-from morpheyes_daemon.simulation.forest import ForestWorld
 from morpheyes_daemon.simulation.rendering import meshes
 from morpheyes_daemon.simulation.rendering.renderer import Rendered, Renderer
 from morpheyes_daemon.simulation.rendering.scene import Material, Mesh, MovingObject, Scene
 from morpheyes_daemon.simulation.rendering.textures import Texture, finished
-from morpheyes_daemon.simulation.worlds import WorldFile, build_world
+from morpheyes_daemon.simulation.worlds.forest_world import ForestWorld
+from morpheyes_daemon.simulation.worlds.loader import WorldFile, build_world
 from morpheyes_daemon.transforms import R_FRD_CAM, Array, R_from_rotvec, R_from_rpy, inverse, pose
 
 SMALL = Pinhole(96, 72, 111.0, 47.5, 35.5)

@@ -10,11 +10,11 @@ import pytest
 
 from morpheyes_daemon.config.yaml_errors import parse_model
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.simulation.collision import VehicleShape
-from morpheyes_daemon.simulation.forest import ForestWorld, plant
 from morpheyes_daemon.simulation.rendering.scene import Light
-from morpheyes_daemon.simulation.trees import Tree
-from morpheyes_daemon.simulation.worlds import Daylight, WorldFile, build_world, load_world, world_names
+from morpheyes_daemon.simulation.worlds.collision import VehicleShape
+from morpheyes_daemon.simulation.worlds.forest_world import ForestWorld, plant
+from morpheyes_daemon.simulation.worlds.loader import Daylight, WorldFile, build_world, load_world, world_names
+from morpheyes_daemon.simulation.worlds.trees import Tree
 
 CONTROL_RADIUS_M = 0.17
 """Footprint of the straight-line control run."""

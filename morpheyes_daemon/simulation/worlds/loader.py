@@ -18,18 +18,18 @@ from pydantic import Field, model_validator
 from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.config.yaml_errors import load_model
 from morpheyes_daemon.errors import ConfigError
-from morpheyes_daemon.simulation.collision import CollisionWorld, VehicleShape
-from morpheyes_daemon.simulation.contents import FLYING_HEIGHT_M, START_ROOM_M, Contents, Disc, GapTruth
-from morpheyes_daemon.simulation.forest import ForestWorld, forest_contents
-from morpheyes_daemon.simulation.gap import GapWorld, gap_contents
-from morpheyes_daemon.simulation.ground import LEVEL, Ground, Relief
 from morpheyes_daemon.simulation.rendering import meshes, textures
 from morpheyes_daemon.simulation.rendering.materials import materials_of, textures_of
 from morpheyes_daemon.simulation.rendering.scene import SKY_OBJECT, Bgr, Light, Mesh, Scene
-from morpheyes_daemon.simulation.room import Cube, RoomWorld, cube_contents, room_contents, room_light
+from morpheyes_daemon.simulation.worlds.collision import CollisionWorld, VehicleShape
+from morpheyes_daemon.simulation.worlds.forest_world import ForestWorld, forest_contents
+from morpheyes_daemon.simulation.worlds.gap_world import GapWorld, gap_contents
+from morpheyes_daemon.simulation.worlds.ground import LEVEL, Ground, Relief
+from morpheyes_daemon.simulation.worlds.room_world import Cube, RoomWorld, cube_contents, room_contents, room_light
+from morpheyes_daemon.simulation.worlds.world import FLYING_HEIGHT_M, START_ROOM_M, Contents, Disc, GapTruth
 from morpheyes_daemon.transforms import Array
 
-FOLDER = Path(__file__).parent / "worlds"
+FOLDER = Path(__file__).parent
 
 
 class MixedWorld(Section):

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from morpheyes_daemon.simulation.collision import MovingObstacles, Solid
-from morpheyes_daemon.simulation.ground import LEVEL, Ground
-from morpheyes_daemon.simulation.motion import PoseAt
 from morpheyes_daemon.simulation.rendering.meshes import Surface
 from morpheyes_daemon.simulation.rendering.scene import Bgr, Material, Mesh, MovingObject
 from morpheyes_daemon.simulation.rendering.textures import Texture
+from morpheyes_daemon.simulation.worlds.collision import MovingObstacles, Solid
+from morpheyes_daemon.simulation.worlds.ground import LEVEL, Ground
+from morpheyes_daemon.simulation.worlds.trajectories import PoseAt
 from morpheyes_daemon.transforms import Array
 
 FLYING_HEIGHT_M = 1.5

@@ -13,8 +13,8 @@ import numpy as np
 
 from morpheyes_daemon.config.vehicle import Footprint, Mount
 from morpheyes_daemon.simulation.camera.true_rig import T_frd_rig
-from morpheyes_daemon.simulation.convex import BOX, CYLINDER, ELLIPSOID, FRUSTUM, PRISM, nearest
 from morpheyes_daemon.simulation.rendering.meshes import icosphere
+from morpheyes_daemon.simulation.worlds.gjk import BOX, CYLINDER, ELLIPSOID, FRUSTUM, PRISM, nearest
 from morpheyes_daemon.transforms import Array, pose
 
 SIZE = 9

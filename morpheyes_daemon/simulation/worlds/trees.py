@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.simulation.collision import Solid, ellipsoid_solid, frustum_solid
-from morpheyes_daemon.simulation.contents import Disc
 from morpheyes_daemon.simulation.rendering import meshes
 from morpheyes_daemon.simulation.rendering.scene import Bgr, Light, Mesh
-from morpheyes_daemon.simulation.species import Layer, Species
+from morpheyes_daemon.simulation.worlds.collision import Solid, ellipsoid_solid, frustum_solid
+from morpheyes_daemon.simulation.worlds.species import Layer, Species
+from morpheyes_daemon.simulation.worlds.world import Disc
 from morpheyes_daemon.transforms import Array
 
 RANGES = ((0.0, 16.0), (16.0, 40.0), (40.0, 110.0))

@@ -11,11 +11,11 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from morpheyes_daemon.config.vehicle import Section
-from morpheyes_daemon.simulation.collision import MovingObstacles, Obstacles, box_solid
-from morpheyes_daemon.simulation.contents import FLYING_HEIGHT_M, START_ROOM_M, Contents, lit
-from morpheyes_daemon.simulation.motion import along_waypoints
 from morpheyes_daemon.simulation.rendering import meshes
 from morpheyes_daemon.simulation.rendering.scene import GROUND_OBJECT, Light, MovingObject
+from morpheyes_daemon.simulation.worlds.collision import MovingObstacles, Obstacles, box_solid
+from morpheyes_daemon.simulation.worlds.trajectories import along_waypoints
+from morpheyes_daemon.simulation.worlds.world import FLYING_HEIGHT_M, START_ROOM_M, Contents, lit
 from morpheyes_daemon.transforms import Array, pose
 
 CUBE_OBJECT, ROOM_OBJECT = 1, 2

@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from morpheyes_daemon.simulation.collision import Solid, prism_solid
 from morpheyes_daemon.simulation.rendering.meshes import Surface, joined, quad_triangles
+from morpheyes_daemon.simulation.worlds.collision import Solid, prism_solid
 from morpheyes_daemon.transforms import Array, pose
 
 Quads = Array

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from morpheyes_daemon.config.vehicle import Section
-from morpheyes_daemon.simulation.contents import START_ROOM_M, Contents
-from morpheyes_daemon.simulation.ground import Ground, Relief, lay
 from morpheyes_daemon.simulation.rendering import meshes, textures
 from morpheyes_daemon.simulation.rendering.scene import GROUND_OBJECT, Light, Material, Mesh
-from morpheyes_daemon.simulation.species import BROADLEAVES, CONIFERS, broadleaf, conifer
-from morpheyes_daemon.simulation.trees import Tree, tree_meshes
-from morpheyes_daemon.simulation.undergrowth import Area, Glades, Undergrowth, bushes, with_branches, with_bushes
+from morpheyes_daemon.simulation.worlds.ground import Ground, Relief, lay
+from morpheyes_daemon.simulation.worlds.species import BROADLEAVES, CONIFERS, broadleaf, conifer
+from morpheyes_daemon.simulation.worlds.trees import Tree, tree_meshes
+from morpheyes_daemon.simulation.worlds.undergrowth import Area, Glades, Undergrowth, bushes, with_branches, with_bushes
+from morpheyes_daemon.simulation.worlds.world import START_ROOM_M, Contents
 from morpheyes_daemon.transforms import Array
 
 LIGHT_MAP_PX = 2048

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from morpheyes_daemon.config.vehicle import Section
-from morpheyes_daemon.simulation.ground import Ground
-from morpheyes_daemon.simulation.species import BUSHES, bush
-from morpheyes_daemon.simulation.trees import Branch, Tree
+from morpheyes_daemon.simulation.worlds.ground import Ground
+from morpheyes_daemon.simulation.worlds.species import BUSHES, bush
+from morpheyes_daemon.simulation.worlds.trees import Branch, Tree
 from morpheyes_daemon.transforms import Array
 
 Glades = tuple[tuple[float, float, float], ...]

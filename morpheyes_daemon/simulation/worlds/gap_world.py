@@ -10,13 +10,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from morpheyes_daemon.config.vehicle import Section
-from morpheyes_daemon.simulation.collision import MovingObstacles, Obstacles, box_solid
-from morpheyes_daemon.simulation.contents import Contents, GapTruth, lit
-from morpheyes_daemon.simulation.motion import Motion, swaying
-from morpheyes_daemon.simulation.openings import Shape, outline
 from morpheyes_daemon.simulation.rendering import meshes
 from morpheyes_daemon.simulation.rendering.scene import GROUND_OBJECT, Light, Mesh, MovingObject
-from morpheyes_daemon.simulation.wall import Wall
+from morpheyes_daemon.simulation.worlds.collision import MovingObstacles, Obstacles, box_solid
+from morpheyes_daemon.simulation.worlds.openings import Shape, outline
+from morpheyes_daemon.simulation.worlds.trajectories import Motion, swaying
+from morpheyes_daemon.simulation.worlds.wall_geometry import Wall
+from morpheyes_daemon.simulation.worlds.world import Contents, GapTruth, lit
 from morpheyes_daemon.transforms import Array, pose
 
 WALL_OBJECT, MURAL_OBJECT = 1, 2

@@ -1,0 +1,1 @@
+"""Worlds: loader, forest, gap and room, trajectories, collision."""
