@@ -7,8 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.forest import ForestParameters
-from morpheyes_daemon.strategies.turns import MOST_TURN_RAD, RESPONSE_S, homing_m_s, slim_margin_m, turnable_share
+from morpheyes_daemon.strategies.forest.strategy import ForestParameters
+from morpheyes_daemon.strategies.forest.turn_feasibility import (
+    MOST_TURN_RAD,
+    RESPONSE_S,
+    homing_m_s,
+    slim_margin_m,
+    turnable_share,
+)
 from morpheyes_daemon.transforms import wrap_rad
 
 TREE = np.array([[1.65, 1.5]])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.memory import STEP_M, ObstacleMemory
+from morpheyes_daemon.strategies.forest.obstacle_memory import STEP_M, ObstacleMemory
 from morpheyes_daemon.strategies.profile import ObstacleProfile
 from tests.seen_from_above import BINS, blind, empty_profile, with_points
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.strategies.way_around import PATIENCE_S, STALLED_S, WayAround
+from morpheyes_daemon.strategies.forest.bug_algorithm import PATIENCE_S, STALLED_S, WayAround
 
 LATER_NS = round((STALLED_S + 1.0) * S)
 HEADINGS = np.linspace(-0.5, 0.5, 11)

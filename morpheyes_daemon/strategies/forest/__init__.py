@@ -1,0 +1,1 @@
+"""The forest mission: fly to a goal among obstacles."""
