@@ -24,7 +24,7 @@ from morpheyes_daemon.simulation.worlds.world import GapTruth
 from morpheyes_daemon.stereo.depth import DepthEstimator, grey
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import View
-from morpheyes_daemon.strategies.gap_percept import GapPercept
+from morpheyes_daemon.strategies.gap.perception import GapPercept
 from morpheyes_daemon.transforms import Array, pose
 
 RANGES_M = (5.0, 3.4, 2.0)

@@ -19,7 +19,7 @@ from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.stereo.depth import grey
 from morpheyes_daemon.stereo.image_files import read_picture
-from morpheyes_daemon.strategies.wall import Mask, split_inverse
+from morpheyes_daemon.strategies.gap.wall_segmentation import Mask, split_inverse
 
 OPENING, IGNORED = 255, 128
 """In the masks; the cloth of scene A looks like a part of the hole but moves with the wall."""

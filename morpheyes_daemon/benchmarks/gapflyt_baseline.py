@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.messages.core import FloatMap, Image
-from morpheyes_daemon.strategies.wall import Mask
+from morpheyes_daemon.strategies.gap.wall_segmentation import Mask
 
 STACK = 4
 """Frames beside the reference, as in their figure 4."""

@@ -21,7 +21,7 @@ from morpheyes_daemon.simulation.worlds.gap_world import GapWorld, drawn_shape
 from morpheyes_daemon.simulation.worlds.loader import load_world
 from morpheyes_daemon.stereo.rectify import Rectifier
 from morpheyes_daemon.stereo.rig import RigModel
-from morpheyes_daemon.strategies.gap_percept import GapPercept
+from morpheyes_daemon.strategies.gap.perception import GapPercept
 from morpheyes_daemon.transforms import Array, inverse, rpy_from_R
 
 BESIDE_M = 0.6

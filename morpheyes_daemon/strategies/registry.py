@@ -17,7 +17,7 @@ from morpheyes_daemon.strategies.base import Strategy, StrategyParameters
 BUILT_IN = {
     "forest": "morpheyes_daemon.strategies.forest.strategy:Forest",
     "imo": "morpheyes_daemon.strategies.imo.strategy:Imo",
-    "gap": "morpheyes_daemon.strategies.gap:Gap",
+    "gap": "morpheyes_daemon.strategies.gap.strategy:Gap",
 }
 
 

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.gap_crossing import KEPT_S, SLOW_M_S, TURNS_RAD, Crossing
-from morpheyes_daemon.strategies.gap_parameters import GapParameters
-from morpheyes_daemon.strategies.gap_track import PointTrack
+from morpheyes_daemon.strategies.gap.crossing import KEPT_S, SLOW_M_S, TURNS_RAD, Crossing
+from morpheyes_daemon.strategies.gap.opening_tracker import PointTrack
+from morpheyes_daemon.strategies.gap.parameters import GapParameters
 
 S = 1_000_000_000
 WATCHED_S, NOW_NS = 18.0, 18 * S

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from walls import PINHOLE, T_ned_rect, depth_map, depth_of_wall, rectangle
 
-from morpheyes_daemon.strategies.opening import Silhouette, find_openings, passage
-from morpheyes_daemon.strategies.wall import median, split
+from morpheyes_daemon.strategies.gap.openings import Silhouette, find_openings, passage
+from morpheyes_daemon.strategies.gap.wall_segmentation import median, split
 
 VEHICLE = Silhouette(0.337, 0.187)
 PX_M = 4.0 / PINHOLE.f_px

@@ -11,10 +11,10 @@ from morpheyes_daemon.control.path_following import LEAN_LAG_S, LineKeeper
 from morpheyes_daemon.messages.core import DepthSummary, Intent, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation
-from morpheyes_daemon.strategies.gap import Gap, Phase
-from morpheyes_daemon.strategies.gap_parameters import GapParameters
-from morpheyes_daemon.strategies.gap_percept import GapPercept
-from morpheyes_daemon.strategies.opening import Opening, Place
+from morpheyes_daemon.strategies.gap.openings import Opening, Place
+from morpheyes_daemon.strategies.gap.parameters import GapParameters
+from morpheyes_daemon.strategies.gap.perception import GapPercept
+from morpheyes_daemon.strategies.gap.strategy import Gap, Phase
 
 S = 1_000_000_000
 CRAFT = Craft(Footprint(), np.eye(4), (0.1, 0.3), 0.2, 3.0, 0.2)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.gap_track import POSITION_WALK_M_S, PointTrack, Sighting, fit_wave
+from morpheyes_daemon.strategies.gap.opening_tracker import POSITION_WALK_M_S, PointTrack, Sighting, fit_wave
 
 S = 1_000_000_000
 SIGMA = np.full(3, 0.02)

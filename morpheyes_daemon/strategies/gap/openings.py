@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.messages.core import DepthMap, FloatMap, Pinhole
-from morpheyes_daemon.strategies.wall import Box, Mask, Plane, Split, median
+from morpheyes_daemon.strategies.gap.wall_segmentation import Box, Mask, Plane, Split, median
 from morpheyes_daemon.transforms import Array
 
 CELLS = 160

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from morpheyes_daemon.strategies.base import View
-from morpheyes_daemon.strategies.opening import Opening, Place, Silhouette, find_openings, passage
-from morpheyes_daemon.strategies.wall import split
+from morpheyes_daemon.strategies.gap.openings import Opening, Place, Silhouette, find_openings, passage
+from morpheyes_daemon.strategies.gap.wall_segmentation import split
 from morpheyes_daemon.transforms import Array
 
 SAME_M = 0.5

@@ -20,11 +20,11 @@ from morpheyes_daemon.control.baseline import baseline_for
 from morpheyes_daemon.messages.core import Intent, Line, MissionCommand
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, View
-from morpheyes_daemon.strategies.gap_crossing import Crossing
-from morpheyes_daemon.strategies.gap_parameters import GapParameters
-from morpheyes_daemon.strategies.gap_percept import GapPercept, PassedOver, at_range_of, gap_percept, tracked_place
-from morpheyes_daemon.strategies.gap_track import Motion, PointTrack
-from morpheyes_daemon.strategies.opening import Opening, Place, Silhouette
+from morpheyes_daemon.strategies.gap.crossing import Crossing
+from morpheyes_daemon.strategies.gap.opening_tracker import Motion, PointTrack
+from morpheyes_daemon.strategies.gap.openings import Opening, Place, Silhouette
+from morpheyes_daemon.strategies.gap.parameters import GapParameters
+from morpheyes_daemon.strategies.gap.perception import GapPercept, PassedOver, at_range_of, gap_percept, tracked_place
 from morpheyes_daemon.transforms import Array, wrap_rad
 
 

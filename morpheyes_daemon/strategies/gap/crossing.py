@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.strategies.gap_parameters import GapParameters
-from morpheyes_daemon.strategies.gap_track import PointTrack
+from morpheyes_daemon.strategies.gap.opening_tracker import PointTrack
+from morpheyes_daemon.strategies.gap.parameters import GapParameters
 from morpheyes_daemon.transforms import Array
 
 SLOW_M_S, TURNS_RAD = 0.2, math.radians(9.0)

@@ -1,0 +1,1 @@
+"""The gap mission: find an opening in a wall and cross it."""
