@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.messages.core import Track
-from morpheyes_daemon.strategies.imo.finder import Finder
+from morpheyes_daemon.strategies.imo.tracker import Finder
 from tests.moving_square import Square, moved, view
 
 

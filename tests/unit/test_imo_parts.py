@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from morpheyes_daemon.campaigns.imo_metrics import Sample, range_bins, visible_face
 from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.strategies.imo.clusters import clusters
-from morpheyes_daemon.strategies.imo.ego_motion import refine
-from morpheyes_daemon.strategies.imo.filter import Eyes, ObjectFilter, measurement_covariance
-from morpheyes_daemon.strategies.imo.frames import Frame
-from morpheyes_daemon.strategies.imo.sweep import swept_depth
+from morpheyes_daemon.strategies.imo.kalman import Eyes, ObjectFilter, measurement_covariance
+from morpheyes_daemon.strategies.imo.object_segmentation import Expected, sight
+from morpheyes_daemon.strategies.imo.plane_sweep import swept_depth
+from morpheyes_daemon.strategies.imo.rectified_frame import Frame
 from morpheyes_daemon.strategies.imo.tracklets import Movers
-from morpheyes_daemon.strategies.imo.window import Expected, sight
+from morpheyes_daemon.strategies.imo.visual_odometry import refine
 from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rotvec, pose
 from tests.moving_square import Square, view
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from morpheyes_daemon.strategies.imo.features import Mask
-from morpheyes_daemon.strategies.imo.frames import Frame
+from morpheyes_daemon.strategies.imo.rectified_frame import Frame
 from morpheyes_daemon.strategies.imo.tracklets import Movers
 from morpheyes_daemon.transforms import Array
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.stereo.lucas_kanade import follow
-from morpheyes_daemon.strategies.imo.frames import Frame
+from morpheyes_daemon.strategies.imo.rectified_frame import Frame
 from morpheyes_daemon.transforms import Array
 
 Mask = NDArray[np.bool_]

@@ -30,7 +30,7 @@ from morpheyes_daemon.strategies.imo.behaviours import (
     pursuit_velocity,
     way_out,
 )
-from morpheyes_daemon.strategies.imo.finder import Finder
+from morpheyes_daemon.strategies.imo.tracker import Finder
 from morpheyes_daemon.strategies.profile import ObstacleProfile, obstacle_profile
 from morpheyes_daemon.transforms import Array, R_from_rpy, wrap_rad
 

@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.strategies.imo.difference import unexplained
-from morpheyes_daemon.strategies.imo.ego_motion import EgoMotion, refine, surprise, told_motion
 from morpheyes_daemon.strategies.imo.features import (
     Mask,
     corners,
@@ -25,7 +23,9 @@ from morpheyes_daemon.strategies.imo.features import (
     followed,
     seen_by_both,
 )
-from morpheyes_daemon.strategies.imo.frames import Frame
+from morpheyes_daemon.strategies.imo.frame_differencing import unexplained
+from morpheyes_daemon.strategies.imo.rectified_frame import Frame
+from morpheyes_daemon.strategies.imo.visual_odometry import EgoMotion, refine, surprise, told_motion
 from morpheyes_daemon.transforms import Array
 
 LAGS = 5

@@ -14,8 +14,8 @@ import numpy as np
 
 from morpheyes_daemon.messages.core import FloatMap
 from morpheyes_daemon.strategies.imo.features import Mask
-from morpheyes_daemon.strategies.imo.frames import Frame
-from morpheyes_daemon.strategies.imo.sweep import swept_depth
+from morpheyes_daemon.strategies.imo.plane_sweep import swept_depth
+from morpheyes_daemon.strategies.imo.rectified_frame import Frame
 from morpheyes_daemon.transforms import Array
 
 FILL = 1.25

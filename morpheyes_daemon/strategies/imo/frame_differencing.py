@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages.core import FloatMap
-from morpheyes_daemon.strategies.imo.frames import Frame
+from morpheyes_daemon.strategies.imo.rectified_frame import Frame
 from morpheyes_daemon.transforms import Array, inverse
 
 STRIDE = 2

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from morpheyes_daemon.strategies.imo.features import Mask
-from morpheyes_daemon.strategies.imo.frames import Frame
+from morpheyes_daemon.strategies.imo.rectified_frame import Frame
 from morpheyes_daemon.transforms import Array, R_from_rotvec, inverse, pose, skew
 
 ATTITUDE_SIGMA_RAD = 0.008

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.messages.core import FloatMap
-from morpheyes_daemon.strategies.imo.frames import Frame
+from morpheyes_daemon.strategies.imo.rectified_frame import Frame
 
 BLOCK_PX = 5
 BRIGHTNESS_PX = 15

@@ -16,16 +16,16 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import DepthMap, Track
 from morpheyes_daemon.strategies.base import View
 from morpheyes_daemon.strategies.imo.clusters import Cluster, clusters
-from morpheyes_daemon.strategies.imo.filter import (
+from morpheyes_daemon.strategies.imo.kalman import (
     REGISTERED_PX,
     SHAPE_SHARE,
     Eyes,
     ObjectFilter,
     measurement_covariance,
 )
-from morpheyes_daemon.strategies.imo.frames import Frame
+from morpheyes_daemon.strategies.imo.object_segmentation import Expected, Sighting, sight
+from morpheyes_daemon.strategies.imo.rectified_frame import Frame
 from morpheyes_daemon.strategies.imo.tracklets import CHAIN, Tracklets
-from morpheyes_daemon.strategies.imo.window import Expected, Sighting, sight
 from morpheyes_daemon.transforms import Array, inverse
 
 HITS, OF = 3, 5
