@@ -11,7 +11,7 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.messages.core import DepthSummary
 from morpheyes_daemon.strategies.base import Craft
-from morpheyes_daemon.strategies.profile import ObstacleProfile
+from morpheyes_daemon.strategies.obstacles.polar_profile import ObstacleProfile
 from morpheyes_daemon.transforms import R_FRD_CAM, pose
 
 CRAFT = Craft(Footprint(), pose(R_FRD_CAM, np.array([0.09, 0.0, -0.02])), (0.1, 0.3), 0.2, 3.0, 0.2)

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from morpheyes_daemon.strategies.corridor import free_distance_m
+from morpheyes_daemon.strategies.obstacles.corridor import free_distance_m
 
 STEP_M = 0.01
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.strategies.forest.obstacle_memory import STEP_M, ObstacleMemory
-from morpheyes_daemon.strategies.profile import ObstacleProfile
+from morpheyes_daemon.strategies.obstacles.polar_profile import ObstacleProfile
 from tests.seen_from_above import BINS, blind, empty_profile, with_points
 
 MIDDLE = np.array([BINS // 2])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.rise import ground_rise
+from morpheyes_daemon.strategies.obstacles.ground_slope import ground_rise
 
 HEIGHT_M = 1.5
 

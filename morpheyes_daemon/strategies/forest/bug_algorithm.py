@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.strategies.profile import Floats
+from morpheyes_daemon.strategies.obstacles.polar_profile import Floats
 
 STALLED_S = 15.0
 """No nearer to the goal for so long: there is something to go around."""

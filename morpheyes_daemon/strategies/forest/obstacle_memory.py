@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.strategies.profile import Floats, ObstacleProfile
+from morpheyes_daemon.strategies.obstacles.polar_profile import Floats, ObstacleProfile
 
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 

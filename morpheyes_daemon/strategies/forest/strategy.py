@@ -21,11 +21,11 @@ from morpheyes_daemon.control.pid import Pid, PidGains
 from morpheyes_daemon.messages.core import Intent, MissionCommand, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, StrategyParameters, View
-from morpheyes_daemon.strategies.corridor import free_distance_m
 from morpheyes_daemon.strategies.forest.bug_algorithm import WayAround
 from morpheyes_daemon.strategies.forest.obstacle_memory import ObstacleMemory
 from morpheyes_daemon.strategies.forest.turn_feasibility import MOST_TURN_RAD, homing_m_s, slim_margin_m, turnable_share
-from morpheyes_daemon.strategies.profile import Floats, ObstacleProfile, obstacle_profile, wide_runs
+from morpheyes_daemon.strategies.obstacles.corridor import free_distance_m
+from morpheyes_daemon.strategies.obstacles.polar_profile import Floats, ObstacleProfile, obstacle_profile, wide_runs
 from morpheyes_daemon.transforms import wrap_rad
 
 

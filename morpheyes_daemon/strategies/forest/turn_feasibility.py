@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from morpheyes_daemon.strategies.profile import Floats
+from morpheyes_daemon.strategies.obstacles.polar_profile import Floats
 from morpheyes_daemon.transforms import wrap_rad
 
 RESPONSE_S = 0.7

@@ -19,7 +19,6 @@ from morpheyes_daemon.control.baseline import baseline_for
 from morpheyes_daemon.messages.core import Intent, MissionCommand, Track, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, StrategyParameters, View
-from morpheyes_daemon.strategies.corridor import free_distance_m
 from morpheyes_daemon.strategies.imo.behaviours import (
     Behaviour,
     Dodge,
@@ -31,7 +30,8 @@ from morpheyes_daemon.strategies.imo.behaviours import (
     way_out,
 )
 from morpheyes_daemon.strategies.imo.tracker import Finder
-from morpheyes_daemon.strategies.profile import ObstacleProfile, obstacle_profile
+from morpheyes_daemon.strategies.obstacles.corridor import free_distance_m
+from morpheyes_daemon.strategies.obstacles.polar_profile import ObstacleProfile, obstacle_profile
 from morpheyes_daemon.transforms import Array, R_from_rpy, wrap_rad
 
 TURN_RAD, TURNED_RAD = math.radians(6.0), math.radians(2.0)

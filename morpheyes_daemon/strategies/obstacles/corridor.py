@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from morpheyes_daemon.strategies.profile import Floats
+from morpheyes_daemon.strategies.obstacles.polar_profile import Floats
 
 
 def free_distance_m(points_m: Floats, headings_rad: Floats, half_width_m: float, reach_m: float) -> Floats:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.strategies.base import View
-from morpheyes_daemon.strategies.rise import ground_rise
+from morpheyes_daemon.strategies.obstacles.ground_slope import ground_rise
 from morpheyes_daemon.transforms import R_FRD_CAM
 
 Floats = NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""What a depth map says about obstacles: polar profile, corridor, ground slope."""
