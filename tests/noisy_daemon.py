@@ -27,7 +27,7 @@ from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
-from morpheyes_daemon.supervisor.worker import InlineWorker
+from morpheyes_daemon.vision_worker.inline import InlineWorker
 from morpheyes_daemon.wire import servo as servo_wire
 
 VEHICLE, STRANGER = (1, 1), (77, 7)

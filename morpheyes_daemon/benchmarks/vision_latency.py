@@ -20,8 +20,8 @@ from morpheyes_daemon.messages.core import BaselineEstimate, Perception, RawPair
 from morpheyes_daemon.perception.pipeline import PipelineFactory, VisionJob
 from morpheyes_daemon.stereo.depth import DepthEstimator
 from morpheyes_daemon.stereo.rig import RigModel
-from morpheyes_daemon.supervisor.worker_process import ProcessWorker
 from morpheyes_daemon.transforms import Array, pose
+from morpheyes_daemon.vision_worker.process import ProcessWorker
 
 HEIGHT_M = 1.5
 BASELINE_M = 0.2

@@ -35,7 +35,6 @@ from morpheyes_daemon.safety.gate import Gate, GateOutput, StickLimits
 from morpheyes_daemon.safety.monitor import Guardian, GuardianLimits
 from morpheyes_daemon.safety.states import Action, State, Transition
 from morpheyes_daemon.supervisor.supervisor import Supervisor, Task
-from morpheyes_daemon.supervisor.worker import VisionWorker
 from morpheyes_daemon.tasks.avoidance import avoidance
 from morpheyes_daemon.tasks.baseline import baseline
 from morpheyes_daemon.tasks.capture import capture
@@ -44,6 +43,7 @@ from morpheyes_daemon.tasks.health import Health, health
 from morpheyes_daemon.tasks.mission import mission
 from morpheyes_daemon.tasks.obstacles import obstacles
 from morpheyes_daemon.tasks.sticks import sticks
+from morpheyes_daemon.vision_worker.inline import VisionWorker
 from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride
 
 ALARMS = frozenset(

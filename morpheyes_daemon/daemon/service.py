@@ -33,8 +33,8 @@ from morpheyes_daemon.recorder.flight_log import flight_header, flight_path
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.supervisor.supervisor import Pulse, Task
-from morpheyes_daemon.supervisor.worker_process import ProcessWorker
 from morpheyes_daemon.tasks.health import Health
+from morpheyes_daemon.vision_worker.process import ProcessWorker
 
 JOB_TIMEOUT_S = 2.0
 """A frame that takes longer than this is lost, and the worker with it."""

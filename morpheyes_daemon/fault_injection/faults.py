@@ -21,7 +21,7 @@ from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.simulation.servo.teensy import ServoFault
-from morpheyes_daemon.supervisor.worker import WorkerFailed, WorkerLost
+from morpheyes_daemon.vision_worker.inline import WorkerFailed, WorkerLost
 
 Act = Callable[[FaultFlight], None]
 

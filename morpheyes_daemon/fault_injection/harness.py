@@ -38,7 +38,7 @@ from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
-from morpheyes_daemon.supervisor.worker import InlineWorker
+from morpheyes_daemon.vision_worker.inline import InlineWorker
 
 NEUTRAL_US = (1500, 1500, 1500, 1500)
 """The twin's RCn_TRIM and the middle of its throttle."""

@@ -17,7 +17,7 @@ from morpheyes_daemon.devices.link import Link, LinkOpener, OnBytes, OnLost
 from morpheyes_daemon.errors import DeviceLostError, DeviceNotFoundError
 from morpheyes_daemon.messages.core import Perception, RawPair
 from morpheyes_daemon.perception.pipeline import VisionJob
-from morpheyes_daemon.supervisor.worker import VisionWorker, WorkerLost
+from morpheyes_daemon.vision_worker.inline import VisionWorker, WorkerLost
 
 Passage = Callable[[bytes, OnBytes], None]
 """What becomes of bytes on their way: it hands on to the second argument whatever arrives."""

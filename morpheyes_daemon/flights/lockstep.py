@@ -37,7 +37,7 @@ from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.crew.scripted import GroundCrew
 from morpheyes_daemon.stereo.rig import RigModel
-from morpheyes_daemon.supervisor.worker import InlineWorker
+from morpheyes_daemon.vision_worker.inline import InlineWorker
 
 AUTOPILOT_URL = "memory:autopilot"
 SERVO_URL = "memory:servo"

@@ -36,7 +36,7 @@ from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.report import draw_report
 from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.stereo.rig import RigModel
-from morpheyes_daemon.supervisor.worker_process import ProcessWorker
+from morpheyes_daemon.vision_worker.process import ProcessWorker
 
 READY_LIMIT_S = 600.0
 """World, textures and a first compilation of the renderer; a real GPS takes 42 s."""

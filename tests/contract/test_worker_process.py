@@ -19,9 +19,9 @@ import pytest
 from morpheyes_daemon.clock import MS, run_virtual, running_clock
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame
-from morpheyes_daemon.supervisor.mailbox import Mailbox
-from morpheyes_daemon.supervisor.worker import InlineWorker, WorkerFailed, WorkerLost
-from morpheyes_daemon.supervisor.worker_process import ProcessWorker
+from morpheyes_daemon.vision_worker.inline import InlineWorker, WorkerFailed, WorkerLost
+from morpheyes_daemon.vision_worker.process import ProcessWorker
+from morpheyes_daemon.vision_worker.shared_memory import Mailbox
 from tests.scapegoat import Order, Scapegoat, dies_building, never_built
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the worker needs Unix sockets")
@@ -209,7 +209,7 @@ def _open_fds() -> list[str]:
 ORPHAN = """
 import asyncio, os, signal
 from tests.scapegoat import Order, Scapegoat
-from morpheyes_daemon.supervisor.worker_process import ProcessWorker
+from morpheyes_daemon.vision_worker.process import ProcessWorker
 
 async def main():
     worker = ProcessWorker(Scapegoat, job_timeout_s=60)

@@ -22,8 +22,8 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, Generic, Protocol
 
 from morpheyes_daemon.errors import MorphEyesError, mistake
-from morpheyes_daemon.supervisor.mailbox import Mailbox
-from morpheyes_daemon.supervisor.worker import Job, JobIn, Result, ResultOut, WorkerFailed, WorkerLost
+from morpheyes_daemon.vision_worker.inline import Job, JobIn, Result, ResultOut, WorkerFailed, WorkerLost
+from morpheyes_daemon.vision_worker.shared_memory import Mailbox
 
 BACKOFF_S = (0.0, 0.25, 0.5, 1.0, 2.0, 5.0)
 CLOSE_TIMEOUT_S = 1.0
