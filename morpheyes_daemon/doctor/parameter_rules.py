@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.control import parameters as p
 from morpheyes_daemon.control.loiter import LoiterModel
+from morpheyes_daemon.devices.autopilot.telemetry import DOWNWARD
 from morpheyes_daemon.doctor.evidence import (
     AVOID_STOP,
     BRAKE_DELAY_S,
-    DOWNWARD,
     GPS_VELOCITY,
     IGNORE_OVERRIDES,
     IGNORE_RECEIVER,

@@ -10,22 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from morpheyes_daemon.cli.calibrate.options import (
+    BoardOption,
+    ConfigOption,
+    JsonOption,
+    MarkerOption,
+    SquareOption,
+    ViewsOption,
+)
+
 if TYPE_CHECKING:
     from morpheyes_daemon.config.vehicle import VehicleConfig
     from morpheyes_daemon.messages.core import Image
     from morpheyes_daemon.perception.calibration_check import CheckResult, RigCheck
     from morpheyes_daemon.rig_capture.board_capture import Scene
 
-BoardOption = Annotated[
-    str | None, typer.Option("--board", help="Inner corners such as 9x6, or squares such as charuco:10x7:5X5_1000.")
-]
-SquareOption = Annotated[float | None, typer.Option("--square-mm", help="Side of one square, measured.")]
-MarkerOption = Annotated[float | None, typer.Option("--marker-mm", help="Side of one marker of a ChArUco board.")]
-ViewsOption = Annotated[
-    int | None, typer.Option("--views", min=3, max=200, help="Pairs per baseline; default: 12, for the mount 48.")
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="Vehicle configuration; default: config.yaml.")]
 
 
 def capture(
@@ -53,7 +52,7 @@ def capture(
     from morpheyes_daemon.calibration.solver.mount import MOUNT_VIEWS
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file
     from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
-    from morpheyes_daemon.cli.calibrate.offline import choose_baselines_m, choose_board
+    from morpheyes_daemon.cli.calibrate.options import choose_baselines_m, choose_board
     from morpheyes_daemon.clock import running_clock
     from morpheyes_daemon.config.packaged import load_config
     from morpheyes_daemon.devices.link import open_link
@@ -134,7 +133,7 @@ def repeatability(
     from morpheyes_daemon.calibration.solver.repeatability import draw, figures, positions
     from morpheyes_daemon.calibration.targets.detection import observe
     from morpheyes_daemon.calibration.targets.image_pairs import read_folder
-    from morpheyes_daemon.cli.calibrate.offline import choose_board
+    from morpheyes_daemon.cli.calibrate.options import choose_board
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.stereo.rig import RigModel
 

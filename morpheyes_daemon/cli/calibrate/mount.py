@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from morpheyes_daemon.cli.calibrate.live import BoardOption, ConfigOption, JsonOption, MarkerOption, SquareOption
+from morpheyes_daemon.cli.calibrate.options import BoardOption, ConfigOption, JsonOption, MarkerOption, SquareOption
 
 if TYPE_CHECKING:
     from morpheyes_daemon.calibration.solver.mount import MountSolution, MountViews
@@ -34,7 +34,7 @@ def mount(
 
     from morpheyes_daemon.calibration.solver.mount import read_mount_folder, solve_mount, ways_up
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file
-    from morpheyes_daemon.cli.calibrate.offline import choose_board
+    from morpheyes_daemon.cli.calibrate.options import choose_board
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.config.packaged import load_config
     from morpheyes_daemon.perception.pipeline import build_craft
