@@ -11,9 +11,10 @@ from typing import Any
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.core import Sticks, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.gate import Gate, GateOutput, Lease, StickLimits
+from morpheyes_daemon.messages.safety import Action, GateOutput, State
+from morpheyes_daemon.safety.gate import Gate, Lease, StickLimits
 from morpheyes_daemon.safety.monitor import Guardian, GuardianLimits
-from morpheyes_daemon.safety.states import Action, State, Transition
+from morpheyes_daemon.safety.states import Transition
 from tests.guardian_witness import Witness
 
 LIMITS = StickLimits((1000, 1010, 1020, 1000), (2000, 1990, 1980, 2000), (1500, 1490, 1500, 1510))

@@ -13,9 +13,9 @@ from itertools import groupby
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.core import Sticks, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.gate import GateOutput, Lease, StickLimits
+from morpheyes_daemon.messages.safety import Action, GateOutput
+from morpheyes_daemon.safety.gate import Lease, StickLimits
 from morpheyes_daemon.safety.monitor import GuardianLimits
-from morpheyes_daemon.safety.states import Action
 
 BELIEVABLE_NS = 10 * S
 

@@ -21,9 +21,8 @@ from morpheyes_daemon.messages.core import (
     VehicleState,
 )
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import Action, GateOutput, State
 from morpheyes_daemon.recorder.pictures.scene import Disc, Scene
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import Action, State
 from tests.hand_clock import HandClock
 
 STICK_HZ = 50

@@ -22,7 +22,7 @@ from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.flights.lockstep import FlightPlan, Progress
 from morpheyes_daemon.flights.realtime import RealtimeFlight, realtime_daemon
 from morpheyes_daemon.flights.stick_timing import StickIntervals
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import State
 
 ENGAGE_LIMIT_S = 120.0
 SAMPLE_S = 5.0

@@ -15,8 +15,7 @@ from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages.core import Perception, StereoFrame
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import GateOutput, State
 from morpheyes_daemon.simulation.worlds.gap_world import GapWorld, drawn_shape
 from morpheyes_daemon.simulation.worlds.loader import load_world
 from morpheyes_daemon.stereo.rectify import Rectifier

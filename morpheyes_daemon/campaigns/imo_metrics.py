@@ -18,7 +18,7 @@ from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages.core import Perception, Pinhole, StereoFrame, Track
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.simulation.worlds.loader import load_world
 from morpheyes_daemon.simulation.worlds.room_world import RoomWorld
 from morpheyes_daemon.stereo.rectify import Rectifier

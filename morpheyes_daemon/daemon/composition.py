@@ -30,16 +30,17 @@ from morpheyes_daemon.doctor.parameter_rules import examine_parameters
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import Event, MissionCommand, Perception, Track, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import Action, GateOutput, Health, State
 from morpheyes_daemon.perception.pipeline import VisionJob, build_strategy
-from morpheyes_daemon.safety.gate import Gate, GateOutput, StickLimits
+from morpheyes_daemon.safety.gate import Gate, StickLimits
 from morpheyes_daemon.safety.monitor import Guardian, GuardianLimits
-from morpheyes_daemon.safety.states import Action, State, Transition
+from morpheyes_daemon.safety.states import Transition
 from morpheyes_daemon.supervisor.supervisor import Supervisor, Task
 from morpheyes_daemon.tasks.avoidance import avoidance
 from morpheyes_daemon.tasks.baseline import baseline
 from morpheyes_daemon.tasks.capture import capture
 from morpheyes_daemon.tasks.depth import depth
-from morpheyes_daemon.tasks.health import Health, health
+from morpheyes_daemon.tasks.health import health
 from morpheyes_daemon.tasks.mission import mission
 from morpheyes_daemon.tasks.obstacles import obstacles
 from morpheyes_daemon.tasks.sticks import sticks

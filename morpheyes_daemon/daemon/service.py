@@ -28,12 +28,12 @@ from morpheyes_daemon.doctor.rig import examine_calibration
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import Health
 from morpheyes_daemon.perception.pipeline import PipelineFactory, fitting_rig
 from morpheyes_daemon.recorder.flight_log import flight_header, flight_path
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.supervisor.supervisor import Pulse, Task
-from morpheyes_daemon.tasks.health import Health
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 
 JOB_TIMEOUT_S = 2.0

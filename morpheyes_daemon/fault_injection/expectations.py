@@ -13,7 +13,8 @@ from enum import StrEnum
 
 from morpheyes_daemon.fault_injection import faults as acts
 from morpheyes_daemon.fault_injection.harness import Measured, Sent
-from morpheyes_daemon.safety.states import HOLDING, State
+from morpheyes_daemon.messages.safety import State
+from morpheyes_daemon.safety.states import HOLDING
 
 REACTION_S = 0.25
 """From noticing to neutral sticks on the wire."""

@@ -33,10 +33,10 @@ from morpheyes_daemon.flights.render_cache import SharedStage
 from morpheyes_daemon.flights.sim_vehicle import Stage, StageCamera
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.perception.pipeline import PipelineFactory
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.recorder import Recorder
-from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.vision_worker.inline import InlineWorker
 

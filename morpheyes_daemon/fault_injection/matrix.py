@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from morpheyes_daemon.fault_injection import faults as acts
 from morpheyes_daemon.fault_injection import injectors as sabotage
 from morpheyes_daemon.fault_injection.expectations import Ending, Fault
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.simulation.servo.teensy import ServoFault
 

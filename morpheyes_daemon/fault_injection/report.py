@@ -5,7 +5,7 @@ from __future__ import annotations
 from morpheyes_daemon.fault_injection.expectations import Ending, Fault
 from morpheyes_daemon.fault_injection.matrix import FAULTS
 from morpheyes_daemon.fault_injection.runner import STATES, Row
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import State
 
 _HEAD = (
     "fault",

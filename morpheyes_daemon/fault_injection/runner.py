@@ -27,7 +27,7 @@ from morpheyes_daemon.fault_injection.harness import FaultFlight, Measured
 from morpheyes_daemon.fault_injection.matrix import FAULTS
 from morpheyes_daemon.flights.flight_plan import with_seed
 from morpheyes_daemon.flights.lockstep import FlightPlan
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import State
 
 STATES = (State.PREFLIGHT, State.STANDBY, State.ENGAGED, State.BRAKING, State.HOLD)
 

@@ -24,8 +24,9 @@ from morpheyes_daemon.fault_injection.fork import branch
 from morpheyes_daemon.fault_injection.harness import FaultFlight, Sent
 from morpheyes_daemon.flights.flight_plan import with_seed
 from morpheyes_daemon.flights.lockstep import FlightPlan
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.monitor import LOITER
-from morpheyes_daemon.safety.states import HOLDING, State
+from morpheyes_daemon.safety.states import HOLDING
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 
 WAYS: dict[str, acts.Act] = {"switch": acts.switch_off, "mode": acts.switch_mode(Mode.ALT_HOLD)}

@@ -32,9 +32,8 @@ from morpheyes_daemon.flights.referee import Judge, Outcome, Reported, Verdict
 from morpheyes_daemon.flights.sim_vehicle import Scenario, Stage, StageCamera
 from morpheyes_daemon.messages.core import Event, StereoFrame
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import GateOutput, State
 from morpheyes_daemon.perception.pipeline import PipelineFactory
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.simulation.crew.scripted import GroundCrew
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.vision_worker.inline import InlineWorker

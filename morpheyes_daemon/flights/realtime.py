@@ -29,12 +29,12 @@ from morpheyes_daemon.flights.referee import Verdict
 from morpheyes_daemon.flights.simulator_process import End, PilotAct, Ready, SimulatorJob, simulate
 from morpheyes_daemon.flights.stick_timing import StickBeat, StickIntervals
 from morpheyes_daemon.messages.core import Perception
+from morpheyes_daemon.messages.safety import GateOutput
 from morpheyes_daemon.perception.pipeline import VisionJob
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.reader import read_flight
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.report import draw_report
-from morpheyes_daemon.safety.gate import GateOutput
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 

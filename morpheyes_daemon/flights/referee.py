@@ -11,9 +11,8 @@ from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.clock import S, Ticker
 from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.gate import GateOutput
+from morpheyes_daemon.messages.safety import GateOutput, State
 from morpheyes_daemon.safety.monitor import NOT_RESUMED
-from morpheyes_daemon.safety.states import State
 
 RATE_HZ = 50.0
 GOAL_TOLERANCE_M = 4.0

@@ -28,8 +28,7 @@ from morpheyes_daemon.flights.sim_vehicle import Scenario, Stage
 from morpheyes_daemon.flights.sitl import open_sitl
 from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import GateOutput, State
 from morpheyes_daemon.simulation.airframe.dynamics import Truth
 from morpheyes_daemon.simulation.autopilot.core import TICK_NS
 from morpheyes_daemon.simulation.autopilot.rc_input import Radio

@@ -16,8 +16,7 @@ import numpy as np
 
 from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import Action
+from morpheyes_daemon.messages.safety import Action, GateOutput
 
 
 def stolen_s() -> float:

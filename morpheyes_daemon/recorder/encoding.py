@@ -25,7 +25,7 @@ from pydantic import BaseModel
 
 from morpheyes_daemon.errors import RecordingError
 from morpheyes_daemon.messages.core import Perception, StereoFrame
-from morpheyes_daemon.strategies.base import Observation
+from morpheyes_daemon.messages.mission import Observation
 
 LARGEST_LIST = 64
 OMITTED: Mapping[type, frozenset[str]] = {

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from morpheyes_daemon.config.vehicle import Footprint, VehicleConfig
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import draw_map
 from morpheyes_daemon.recorder.pictures.scene import Scene
 from morpheyes_daemon.recorder.pictures.strips import draw_strips
 from morpheyes_daemon.recorder.reader import Flight
 from morpheyes_daemon.recorder.series import FlightSeries
-from morpheyes_daemon.safety.states import State
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import Event, Intent, Perception
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.monitor import NOT_RESUMED
-from morpheyes_daemon.safety.states import State
 
 Column = NDArray[np.float64]
 

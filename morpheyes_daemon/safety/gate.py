@@ -16,7 +16,8 @@ from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import Sticks
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.states import EFFECTS, Action, State
+from morpheyes_daemon.messages.safety import Action, GateOutput, State, Widths
+from morpheyes_daemon.safety.states import EFFECTS
 
 RELEASE_REPEAT_S = 1.0
 """A lost release datagram leaves the last stick in force, so it is repeated for this long."""
@@ -33,8 +34,6 @@ LATE_NS = 100 * MS
 NARROWEST_US, WIDEST_US = 800, 2200
 """What RCn_MIN and RCn_MAX may be; 0, 65534 and 65535 mean other things than a width."""
 
-Widths = tuple[int, int, int, int]
-"""Roll, pitch, throttle, yaw in microseconds."""
 
 
 class Lease(StrEnum):
@@ -84,23 +83,6 @@ class StickLimits:
             raise DeviceError(f"The sticks' rate limit is {self.slew_us_s} us/s: it must be positive and finite.")
 
 
-@dataclass(frozen=True, slots=True)
-class GateOutput:
-    """What went out at one stick period; the four widths are what was sent, 0 for release and silence."""
-
-    t_ns: int
-    state: State
-    action: Action
-    reason: Reason | None
-    roll_us: int = 0
-    pitch_us: int = 0
-    throttle_us: int = 0
-    yaw_us: int = 0
-
-    @property
-    def widths_us(self) -> Widths:
-        """Roll, pitch, throttle, yaw."""
-        return self.roll_us, self.pitch_us, self.throttle_us, self.yaw_us
 
 
 class Gate:

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.gate import LEASE_REASONS, Lease
 from morpheyes_daemon.safety.monitor import RESUMED
-from morpheyes_daemon.safety.states import CAUSE, EFFECTS, MEANING, TRANSITIONS, State, Trigger, mermaid
+from morpheyes_daemon.safety.states import CAUSE, EFFECTS, MEANING, TRANSITIONS, Trigger, mermaid
 
 PAGE = Path("docs/safety.md")
 BEGIN, END = "<!-- generated: {} -->", "<!-- end -->"

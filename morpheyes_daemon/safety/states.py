@@ -10,29 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from morpheyes_daemon.messages.reasons import Reason
-
-
-class State(StrEnum):
-    """Where the daemon is; `EFFECTS` says what each lets out and `MEANING` what it is."""
-
-    BOOT = "boot"
-    PREFLIGHT = "preflight"
-    STANDBY = "standby"
-    ENGAGED = "engaged"
-    BRAKING = "braking"
-    HOLD = "hold"
-    PILOT = "pilot"
-    RELEASED = "released"
-    FAULT = "fault"
-
-
-class Action(StrEnum):
-    """What the gate sends at one stick period."""
-
-    SILENT = "silent"
-    STICKS = "sticks"
-    NEUTRAL = "neutral"
-    RELEASE = "release"
+from morpheyes_daemon.messages.safety import Action, State
 
 
 class Trigger(StrEnum):

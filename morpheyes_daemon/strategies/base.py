@@ -14,7 +14,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from morpheyes_daemon.config.vehicle import Footprint, Section
-from morpheyes_daemon.messages.core import DepthMap, DepthSummary, Image, MissionCommand, Track, Vector, VehicleState
+from morpheyes_daemon.messages.core import DepthMap, Image, MissionCommand, Track, Vector, VehicleState
+from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.transforms import R_from_rpy
 
 
@@ -59,24 +60,6 @@ class View:
         return T @ self.T_frd_rig @ self.depth.T_rig_rect
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Observation:
-    """What `decide` gets: the newest percept and the vehicle now and at exposure.
-
-    `braking_m` is the distance the vehicle needs to stop from its present speed, `reserve_m` the same with the
-    governor's reaction time; `engaged` tells whether the mission has the vehicle, braking for a gap in the inputs
-    included.
-    """
-
-    now_ns: int
-    percept: Any
-    summary: DepthSummary
-    vehicle: VehicleState
-    at_exposure: VehicleState
-    baseline_m: float
-    braking_m: float
-    reserve_m: float
-    engaged: bool
 
 
 class Strategy(ABC):

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import MS, Clock, S, Ticker
-from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import Health
 from morpheyes_daemon.safety.monitor import Guardian
-from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.supervisor.supervisor import Pulse, Supervisor
 
 REPORT_HZ = 4.0
@@ -19,22 +18,6 @@ LISTEN_HZ = 40.0
 """How often the loop is listened to; a hold-up shorter than its period may be missed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Health:
-    """`ages_s` since each topic's newest message, `rates_hz` since the last report, `restarts` per task.
-
-    `lateness_ms` is the longest that the loop was held up since the last report.
-    """
-
-    t_ns: int
-    state: State
-    reason: Reason
-    missing: Reason | None
-    ages_s: dict[str, float]
-    rates_hz: dict[str, float]
-    restarts: dict[str, int]
-    lateness_ms: float
-    worst_lateness_ms: float
 
 
 async def health(

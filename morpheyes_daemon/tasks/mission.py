@@ -10,11 +10,12 @@ from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.control.governor import Stopping
 from morpheyes_daemon.control.pose_history import VehicleTrack
 from morpheyes_daemon.messages.core import Intent, Perception
+from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.monitor import Guardian
-from morpheyes_daemon.safety.states import State
-from morpheyes_daemon.strategies.base import Observation, Strategy
+from morpheyes_daemon.strategies.base import Strategy
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
 

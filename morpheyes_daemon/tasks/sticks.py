@@ -10,9 +10,9 @@ from morpheyes_daemon.control.pose_history import VehicleTrack
 from morpheyes_daemon.control.stick_controller import FlightControl
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.monitor import Guardian
-from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
 LATE_NS = 100 * MS

@@ -21,8 +21,7 @@ from morpheyes_daemon.dashboard.snapshot import STRIPS
 from morpheyes_daemon.errors import DeviceNotFoundError
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.states import State
-from morpheyes_daemon.tasks.health import Health
+from morpheyes_daemon.messages.safety import Health, State
 from tests.hand_clock import HandClock
 from tests.synthetic_flight import SyntheticFlight
 

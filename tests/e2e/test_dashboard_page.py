@@ -11,8 +11,7 @@ from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.dashboard.server import Dashboard
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.states import State
-from morpheyes_daemon.tasks.health import Health
+from morpheyes_daemon.messages.safety import Health, State
 from tests.hand_clock import HandClock
 from tests.synthetic_flight import SyntheticFlight
 

@@ -23,8 +23,7 @@ from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.flights.realtime import RealtimeFlight, fly_realtime, realtime_daemon
 from morpheyes_daemon.flights.simulator_process import PilotAct
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import Action, State
+from morpheyes_daemon.messages.safety import Action, GateOutput, State
 
 pytest.importorskip("numba")
 SITL = os.environ.get("MORPHEYES_SITL", "")

@@ -21,9 +21,8 @@ from morpheyes_daemon.cli import build
 from morpheyes_daemon.clock import MonotonicClock
 from morpheyes_daemon.daemon.service import ending_by_signal
 from morpheyes_daemon.messages.core import Perception
+from morpheyes_daemon.messages.safety import Action, GateOutput
 from morpheyes_daemon.recorder.reader import Flight, read_flight
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import Action
 from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.autopilot.tcp_server import MavlinkServer
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin

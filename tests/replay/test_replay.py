@@ -15,11 +15,12 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import MissionFile, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import DepthSummary, FloatMap, Intent, MissionCommand, Perception, VehicleState
+from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.perception.pipeline import build_craft
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.replay import replay
-from morpheyes_daemon.strategies.base import Observation, Strategy, StrategyParameters
+from morpheyes_daemon.strategies.base import Strategy, StrategyParameters
 from morpheyes_daemon.strategies.registry import BUILT_IN
 from tests.hand_clock import HandClock
 

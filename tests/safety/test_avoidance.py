@@ -11,8 +11,9 @@ import pytest
 from morpheyes_daemon.clock import S, run_virtual, running_clock
 from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig
 from morpheyes_daemon.errors import DeviceTimeoutError
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.monitor import Guardian
-from morpheyes_daemon.safety.states import HOLDING, State
+from morpheyes_daemon.safety.states import HOLDING
 from morpheyes_daemon.supervisor.supervisor import Pulse
 from morpheyes_daemon.tasks.avoidance import avoidance
 from tests.noisy_daemon import NoisyDaemon

@@ -9,7 +9,7 @@ import pytest
 from morpheyes_daemon.clock import MS, VirtualLoop, run_virtual
 from morpheyes_daemon.config.vehicle import NoServoConfig
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.tasks.health import LISTEN_HZ
 from tests.noisy_daemon import NoisyDaemon
 

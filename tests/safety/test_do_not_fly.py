@@ -10,7 +10,7 @@ from morpheyes_daemon.daemon.composition import ALARMS
 from morpheyes_daemon.doctor.findings import Severity
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import State
 from tests.noisy_daemon import NoisyDaemon
 from tests.unit.test_doctor_parameters import BAD
 

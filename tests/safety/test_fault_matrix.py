@@ -17,7 +17,7 @@ from morpheyes_daemon.fault_injection.matrix import FAULTS
 from morpheyes_daemon.fault_injection.report import page
 from morpheyes_daemon.fault_injection.runner import Row, choose, flights, load_rows, make_row, store_row
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 
 PAGE = Path(__file__).parents[2] / "docs/faults.md"

@@ -10,6 +10,7 @@ import pytest
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.config.vehicle import AutopilotConfig, NoServoConfig, SafetyConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import Action, State
 from morpheyes_daemon.safety.gate import LEASE_REASONS, RELEASE_REPEATS, Lease
 from morpheyes_daemon.safety.monitor import (
     NOT_RESUMED,
@@ -17,7 +18,7 @@ from morpheyes_daemon.safety.monitor import (
     Guardian,
     GuardianLimits,
 )
-from morpheyes_daemon.safety.states import EFFECTS, HOLDING, Action, State, Trigger
+from morpheyes_daemon.safety.states import EFFECTS, HOLDING, Trigger
 from tests.cockpit import LIMITS, OFF_US, ON_US, OTHER_LIMITS, Actor, Cockpit
 
 AT_REST_M_S, IDLE_S, PAUSE_S = 0.15, 1.0, 0.5

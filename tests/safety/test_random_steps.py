@@ -13,9 +13,9 @@ import pytest
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.gate import Lease
 from morpheyes_daemon.safety.monitor import GuardianLimits
-from morpheyes_daemon.safety.states import State
 from tests.cockpit import HEALTHY, LIMITS, OFF_US, ON_US, OTHER_LIMITS, Cockpit
 
 OURS = (Lease.SUPERVISOR, Lease.FRAME, Lease.DEPTH, Lease.MISSION)

@@ -7,6 +7,7 @@ import itertools
 import pytest
 
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import Action, State
 from morpheyes_daemon.safety.generate_docs import PAGE, renewed, sections
 from morpheyes_daemon.safety.states import (
     CAUSE,
@@ -14,9 +15,7 @@ from morpheyes_daemon.safety.states import (
     HOLDING,
     MEANING,
     TRANSITIONS,
-    Action,
     Machine,
-    State,
     Transition,
     Trigger,
     mermaid,

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import Action, State
+from morpheyes_daemon.messages.safety import Action, GateOutput, State
 from morpheyes_daemon.simulation.worlds.collision import VehicleShape
 from morpheyes_daemon.simulation.worlds.loader import build_world, load_world
 

@@ -12,8 +12,7 @@ from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
 from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages.core import Intent, MissionCommand
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import GateOutput, State
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,7 @@ from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.fault_injection import faults as acts
 from morpheyes_daemon.fault_injection.harness import FaultFlight, Sent
 from morpheyes_daemon.flights.flight_plan import make_plan
-from morpheyes_daemon.safety.states import State
+from morpheyes_daemon.messages.safety import State
 
 
 @pytest.mark.slow

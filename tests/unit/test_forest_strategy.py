@@ -7,7 +7,7 @@ import pytest
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import Intent, MissionCommand, VehicleState
-from morpheyes_daemon.strategies.base import Observation
+from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.strategies.forest.strategy import Forest, ForestParameters, Goal
 from morpheyes_daemon.strategies.obstacles.polar_profile import ObstacleProfile
 from tests.seen_from_above import CRAFT, SUMMARY, blind, empty_profile, with_points

@@ -9,8 +9,9 @@ import pytest
 from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.control.path_following import LEAN_LAG_S, LineKeeper
 from morpheyes_daemon.messages.core import DepthSummary, Intent, VehicleState
+from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.strategies.base import Craft, Observation
+from morpheyes_daemon.strategies.base import Craft
 from morpheyes_daemon.strategies.gap.openings import Opening, Place
 from morpheyes_daemon.strategies.gap.parameters import GapParameters
 from morpheyes_daemon.strategies.gap.perception import GapPercept

@@ -8,7 +8,7 @@ import pytest
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import Intent, MissionCommand, Track, VehicleState
-from morpheyes_daemon.strategies.base import Observation
+from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.strategies.imo.behaviours import (
     Dodge,
     ObjectState,

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from morpheyes_daemon.errors import RecordingError
 from morpheyes_daemon.messages.core import DepthSummary, Event, Governed, Perception, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import Action, GateOutput, State
 from morpheyes_daemon.recorder.encoding import find_type, from_plain, to_plain, type_name
 from morpheyes_daemon.recorder.schemas import dataclass_schema
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import Action, State
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.messages.core import BaselineEstimate, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.messages.safety import Action, GateOutput, State
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import DPI, LEFT_IN, RIGHT_IN, WIDTH_IN, draw_map
 from morpheyes_daemon.recorder.pictures.outline import Track, clearances, closest_passes
@@ -21,8 +22,6 @@ from morpheyes_daemon.recorder.pictures.topview import TREE, Pose, TopView
 from morpheyes_daemon.recorder.reader import read_flight
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.series import FlightSeries
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import Action, State
 from morpheyes_daemon.stereo.colours import UNKNOWN_BGR, baseline_bgr, colour_depth
 from tests.hand_clock import HandClock
 from tests.synthetic_flight import SyntheticFlight, forest_scene

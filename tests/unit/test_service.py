@@ -7,8 +7,7 @@ import pytest
 from morpheyes_daemon.daemon.service import SystemdReport, chain_turns, event_line
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.states import State
-from morpheyes_daemon.tasks.health import Health
+from morpheyes_daemon.messages.safety import Health, State
 
 
 def report(state: State = State.STANDBY, reason: Reason = Reason.READY, **ages_s: float) -> Health:

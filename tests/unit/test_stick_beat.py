@@ -6,8 +6,7 @@ from morpheyes_daemon.benchmarks.soak import Sample, judge_soak
 from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.clock import MS
 from morpheyes_daemon.flights.stick_timing import StickBeat
-from morpheyes_daemon.safety.gate import GateOutput
-from morpheyes_daemon.safety.states import Action, State
+from morpheyes_daemon.messages.safety import Action, GateOutput, State
 
 
 def beat_of(*outputs: tuple[int, Action]) -> StickBeat:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.recorder.series import FlightSeries
-from morpheyes_daemon.safety.states import State
 from morpheyes_daemon.stereo.colours import MAX_BASELINE_M, MIN_BASELINE_M
 
 Column = NDArray[np.float64]

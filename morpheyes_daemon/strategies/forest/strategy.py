@@ -19,8 +19,9 @@ from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.control.baseline import baseline_for
 from morpheyes_daemon.control.pid import Pid, PidGains
 from morpheyes_daemon.messages.core import Intent, MissionCommand, VehicleState
+from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, StrategyParameters, View
+from morpheyes_daemon.strategies.base import Craft, Strategy, StrategyParameters, View
 from morpheyes_daemon.strategies.forest.bug_algorithm import WayAround
 from morpheyes_daemon.strategies.forest.obstacle_memory import ObstacleMemory
 from morpheyes_daemon.strategies.forest.turn_feasibility import MOST_TURN_RAD, homing_m_s, slim_margin_m, turnable_share

@@ -18,8 +18,9 @@ import numpy as np
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.control.baseline import baseline_for
 from morpheyes_daemon.messages.core import Intent, Line, MissionCommand
+from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, View
+from morpheyes_daemon.strategies.base import Craft, Strategy, View
 from morpheyes_daemon.strategies.gap.crossing import Crossing
 from morpheyes_daemon.strategies.gap.opening_tracker import Motion, PointTrack
 from morpheyes_daemon.strategies.gap.openings import Opening, Place, Silhouette

@@ -17,8 +17,9 @@ from pydantic import Field, model_validator
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.control.baseline import baseline_for
 from morpheyes_daemon.messages.core import Intent, MissionCommand, Track, VehicleState
+from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.strategies.base import Craft, Observation, Strategy, StrategyParameters, View
+from morpheyes_daemon.strategies.base import Craft, Strategy, StrategyParameters, View
 from morpheyes_daemon.strategies.imo.behaviours import (
     Behaviour,
     Dodge,
