@@ -12,7 +12,8 @@ from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.core import Sticks, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, GateOutput, State
-from morpheyes_daemon.safety.gate import Gate, Lease, StickLimits
+from morpheyes_daemon.safety.gate import Gate, StickLimits
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import Guardian, GuardianLimits
 from morpheyes_daemon.safety.states import Transition
 from tests.guardian_witness import Witness

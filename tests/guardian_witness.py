@@ -14,7 +14,8 @@ from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.core import Sticks, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, GateOutput
-from morpheyes_daemon.safety.gate import Lease, StickLimits
+from morpheyes_daemon.safety.gate import StickLimits
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import GuardianLimits
 
 BELIEVABLE_NS = 10 * S

@@ -24,7 +24,7 @@ from morpheyes_daemon.devices.link import Link, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.messages.core import Event, RawPair, Sticks
 from morpheyes_daemon.messages.safety import State
-from morpheyes_daemon.safety.gate import Lease
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 from morpheyes_daemon.vision_worker.inline import InlineWorker

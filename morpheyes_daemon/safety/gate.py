@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import Sticks
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, GateOutput, State, Widths
+from morpheyes_daemon.safety.leases import LEASE_REASONS, LONGEST_LEASE_NS, Lease
 from morpheyes_daemon.safety.states import EFFECTS
 
 RELEASE_REPEAT_S = 1.0
@@ -25,8 +25,6 @@ RELEASE_REPEAT_S = 1.0
 RELEASE_REPEATS = 20
 """And at least this often, should the loop have been held up meanwhile."""
 
-LONGEST_LEASE_NS = 10 * S
-"""A lease or an offer that claims to last longer carries a wrong stamp and is not believed."""
 
 LATE_NS = 100 * MS
 """After a pause as long as this the sticks start from neutral again."""
@@ -36,27 +34,8 @@ NARROWEST_US, WIDEST_US = 800, 2200
 
 
 
-class Lease(StrEnum):
-    """Inputs without which no stick is deflected, the gravest first; the reason of each is in `LEASE_REASONS`."""
-
-    LINK = "link"
-    SWITCH = "switch"
-    SUPERVISOR = "supervisor"
-    VEHICLE = "vehicle"
-    FRAME = "frame"
-    DEPTH = "depth"
-    MISSION = "mission"
 
 
-LEASE_REASONS: dict[Lease, Reason] = {
-    Lease.LINK: Reason.LINK_LOST,
-    Lease.SWITCH: Reason.SWITCH_STALE,
-    Lease.SUPERVISOR: Reason.SUPERVISOR_STALE,
-    Lease.VEHICLE: Reason.VEHICLE_STALE,
-    Lease.FRAME: Reason.FRAME_STALE,
-    Lease.DEPTH: Reason.DEPTH_STALE,
-    Lease.MISSION: Reason.MISSION_STALE,
-}
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from morpheyes_daemon.messages.safety import State
-from morpheyes_daemon.safety.gate import LEASE_REASONS, Lease
+from morpheyes_daemon.safety.leases import LEASE_REASONS, Lease
 from morpheyes_daemon.safety.monitor import RESUMED
 from morpheyes_daemon.safety.states import CAUSE, EFFECTS, MEANING, TRANSITIONS, Trigger, mermaid
 

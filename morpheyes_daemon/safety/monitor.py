@@ -16,7 +16,8 @@ from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, GateOutput, State
 from morpheyes_daemon.safety.engage_switch import EngageSwitch
-from morpheyes_daemon.safety.gate import LEASE_REASONS, Gate, Lease
+from morpheyes_daemon.safety.gate import Gate
+from morpheyes_daemon.safety.leases import LEASE_REASONS, Lease
 from morpheyes_daemon.safety.states import HOLDING, Machine, Transition, Trigger
 from morpheyes_daemon.safety.vehicle_health import concern
 

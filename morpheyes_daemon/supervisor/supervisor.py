@@ -16,7 +16,7 @@ from morpheyes_daemon.clock import Clock, S, Ticker
 from morpheyes_daemon.errors import MorphEyesError, mistake
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.gate import Lease
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import Guardian
 
 RATE_HZ = 20.0

@@ -7,7 +7,8 @@ from typing import Protocol
 from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.devices.camera import Camera
 from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame
-from morpheyes_daemon.safety.gate import Gate, Lease
+from morpheyes_daemon.safety.gate import Gate
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
 

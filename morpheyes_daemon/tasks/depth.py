@@ -11,7 +11,8 @@ from morpheyes_daemon.control.pose_history import VehicleTrack
 from morpheyes_daemon.messages.core import Event, Perception
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.perception.pipeline import VisionJob
-from morpheyes_daemon.safety.gate import Gate, Lease
+from morpheyes_daemon.safety.gate import Gate
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
 WORTHLESS = frozenset({Reason.IMAGE_BAD, Reason.EYES_APART, Reason.DEPTH_SCALE})

@@ -13,7 +13,7 @@ from morpheyes_daemon.messages.core import Intent, Perception
 from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
-from morpheyes_daemon.safety.gate import Lease
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import Guardian
 from morpheyes_daemon.strategies.base import Strategy
 from morpheyes_daemon.supervisor.supervisor import Pulse

@@ -7,7 +7,8 @@ from typing import Protocol
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import Clock, Ticker
 from morpheyes_daemon.messages.core import FloatMap
-from morpheyes_daemon.safety.gate import Gate, Lease
+from morpheyes_daemon.safety.gate import Gate
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
 RATE_HZ = 12.0

@@ -11,7 +11,7 @@ from morpheyes_daemon.control.stick_controller import FlightControl
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
-from morpheyes_daemon.safety.gate import Lease
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import Guardian
 from morpheyes_daemon.supervisor.supervisor import Pulse
 

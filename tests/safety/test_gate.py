@@ -12,7 +12,8 @@ from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import Sticks
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, GateOutput, State
-from morpheyes_daemon.safety.gate import LEASE_REASONS, Gate, Lease, StickLimits
+from morpheyes_daemon.safety.gate import Gate, StickLimits
+from morpheyes_daemon.safety.leases import LEASE_REASONS, Lease
 from morpheyes_daemon.safety.states import EFFECTS, HOLDING
 
 LIMITS = StickLimits((1000, 1010, 1020, 1030), (2000, 1990, 1980, 1970), (1500, 1490, 1510, 1505))

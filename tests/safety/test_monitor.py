@@ -11,7 +11,8 @@ from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.config.vehicle import AutopilotConfig, NoServoConfig, SafetyConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, State
-from morpheyes_daemon.safety.gate import LEASE_REASONS, RELEASE_REPEATS, Lease
+from morpheyes_daemon.safety.gate import RELEASE_REPEATS
+from morpheyes_daemon.safety.leases import LEASE_REASONS, Lease
 from morpheyes_daemon.safety.monitor import (
     NOT_RESUMED,
     RESUMED,

@@ -12,7 +12,8 @@ import pytest
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import S, run_virtual, running_clock
 from morpheyes_daemon.messages.core import DepthSummary, FloatMap, Perception
-from morpheyes_daemon.safety.gate import Gate, Lease
+from morpheyes_daemon.safety.gate import Gate
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
 from morpheyes_daemon.tasks.obstacles import RATE_HZ, obstacles
 

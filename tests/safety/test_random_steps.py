@@ -14,7 +14,7 @@ import pytest
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
-from morpheyes_daemon.safety.gate import Lease
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import GuardianLimits
 from tests.cockpit import HEALTHY, LIMITS, OFF_US, ON_US, OTHER_LIMITS, Cockpit
 

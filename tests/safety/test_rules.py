@@ -11,7 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, State
-from morpheyes_daemon.safety.gate import Lease
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import GuardianLimits
 from morpheyes_daemon.safety.states import EFFECTS, HOLDING
 from tests.cockpit import HEALTHY, LIMITS, OFF_US, ON_US, OTHER_LIMITS, Cockpit

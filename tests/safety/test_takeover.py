@@ -10,7 +10,7 @@ import pytest
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, State
-from morpheyes_daemon.safety.gate import Lease
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.states import HOLDING
 from tests.cockpit import OFF_US, ON_US, Cockpit
 

@@ -12,7 +12,7 @@ from morpheyes_daemon.control.pose_history import VehicleTrack
 from morpheyes_daemon.messages.core import DepthSummary, Intent, Perception
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
-from morpheyes_daemon.safety.gate import Lease
+from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
 from morpheyes_daemon.tasks.mission import mission
 
