@@ -6,11 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from morpheyes_daemon.simulation.airframe.second_order import GRAVITY_M_S2, SecondOrder
 from morpheyes_daemon.simulation.autopilot.position_controller import (
-    GRAVITY_M_S2,
     LoiterLaw,
     LoiterReference,
-    SecondOrder,
     Tracking,
     VelocityReference,
     square_root_gain,

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.simulation.airframe.dynamics import STEP_NS, STEP_S, Airframe, Vehicle
+from morpheyes_daemon.simulation.airframe.second_order import GRAVITY_M_S2
 from morpheyes_daemon.simulation.airframe.wind import WindConditions
-from morpheyes_daemon.simulation.autopilot.position_controller import GRAVITY_M_S2
 
 STILL = Airframe(shiver_rad=0.0)
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.simulation.airframe.second_order import GRAVITY_M_S2, LEAN_LAG_S, SecondOrder
 from morpheyes_daemon.simulation.airframe.wind import CALM, Wind, WindConditions
-from morpheyes_daemon.simulation.autopilot.position_controller import GRAVITY_M_S2, LEAN_LAG_S, SecondOrder
 from morpheyes_daemon.simulation.worlds.ground import LEVEL, Ground
 from morpheyes_daemon.transforms import R_from_rpy, pose, wrap_rad
 

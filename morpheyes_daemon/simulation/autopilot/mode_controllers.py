@@ -11,9 +11,9 @@ import math
 from enum import Enum, auto
 
 from morpheyes_daemon.simulation.airframe.dynamics import STEP_S, Vehicle
+from morpheyes_daemon.simulation.airframe.second_order import GRAVITY_M_S2
 from morpheyes_daemon.simulation.autopilot.flight_modes import FlightSettings, Mode
 from morpheyes_daemon.simulation.autopilot.position_controller import (
-    GRAVITY_M_S2,
     LoiterReference,
     Reference,
     Tracking,

@@ -14,13 +14,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-GRAVITY_M_S2 = 9.80665
+from morpheyes_daemon.simulation.airframe.second_order import GRAVITY_M_S2, LEAN_LAG_S, SecondOrder
 
 BRAKE_GAIN_1_S = 1.06
 """AC_Loiter takes half of PSC_VELXY_P, 1.0; recorded brakes fit best with this."""
 
-LEAN_LAG_S = 0.075
-"""Both poles of the lean response; from recorded steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,25 +44,6 @@ def square_root_gain(error: float, gain: float, limit: float) -> float:
     return math.copysign(math.sqrt(2.0 * limit * (size - 0.5 * linear)), error)
 
 
-class SecondOrder:
-    """A critically damped second-order lag."""
-
-    __slots__ = ("_rate", "_w", "value")
-
-    def __init__(self, lag_s: float, value: float = 0.0) -> None:
-        self._w = 1.0 / lag_s
-        self._rate = 0.0
-        self.value = value
-
-    def step(self, target: float, dt_s: float) -> float:
-        """Move towards `target` for `dt_s` and return the new value."""
-        self._rate += (self._w * self._w * (target - self.value) - 2.0 * self._w * self._rate) * dt_s
-        self.value += self._rate * dt_s
-        return self.value
-
-    def reset(self, value: float) -> None:
-        """Come to rest at `value`."""
-        self.value, self._rate = value, 0.0
 
 
 class Reference:
