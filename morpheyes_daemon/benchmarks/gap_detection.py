@@ -19,7 +19,7 @@ from morpheyes_daemon.flights.flight_plan import with_seed
 from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages.core import BaselineEstimate, Image, RawPair, StereoFrame, VehicleState
-from morpheyes_daemon.perception.pipeline import build_strategy
+from morpheyes_daemon.perception.craft import build_strategy
 from morpheyes_daemon.simulation.worlds.world import GapTruth
 from morpheyes_daemon.stereo.depth import DepthEstimator, grey
 from morpheyes_daemon.stereo.rig import RigModel

@@ -16,13 +16,14 @@ import numpy as np
 from morpheyes_daemon.benchmarks.calibration_error import evaluate_rig
 from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.clock import S
+from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount, ServoMotion
 from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame, VehicleState
 from morpheyes_daemon.perception.camera_motion import EyeMotion, eye_motion
 from morpheyes_daemon.perception.extrinsics_monitor import DriftLimits, DriftMonitor, DriftReport
 from morpheyes_daemon.perception.yaw_estimator import STILL, Uncertain
 from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
-from morpheyes_daemon.simulation.camera.true_rig import RigTwin, T_frd_rig
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.simulation.rendering.renderer import Renderer
 from morpheyes_daemon.simulation.worlds.loader import build_world, load_world
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of

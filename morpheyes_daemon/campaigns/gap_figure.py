@@ -15,9 +15,9 @@ import numpy as np
 
 from morpheyes_daemon.campaigns.forest_table import Row
 from morpheyes_daemon.campaigns.gap_metrics import BEFORE_M, BEHIND_M
+from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Footprint, Mount
 from morpheyes_daemon.flights.lockstep import FlightPlan
-from morpheyes_daemon.simulation.camera.true_rig import T_frd_rig
 from morpheyes_daemon.simulation.worlds.gap_world import GapWorld, gap_truth
 from morpheyes_daemon.simulation.worlds.loader import load_world
 from morpheyes_daemon.stereo.colours import baseline_bgr

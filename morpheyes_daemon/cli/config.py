@@ -19,8 +19,9 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Check configuration and mission files; errors name file, line, key, what was found and what is allowed."""
-    from morpheyes_daemon.config.packaged import find_mission, load_config, load_mission, mission_names, shipped
+    from morpheyes_daemon.config.packaged import load_config, shipped
     from morpheyes_daemon.errors import ConfigError
+    from morpheyes_daemon.strategies.missions import find_mission, load_mission, mission_names
 
     if not files:
         own = Path("config.yaml")
@@ -51,8 +52,9 @@ def show(
     """Show a file with every default filled in, or with --keys what each key may be."""
     import yaml
 
-    from morpheyes_daemon.config.packaged import load_config, load_mission
+    from morpheyes_daemon.config.packaged import load_config
     from morpheyes_daemon.config.vehicle import VehicleConfig
+    from morpheyes_daemon.strategies.missions import load_mission
     from morpheyes_daemon.strategies.registry import find_strategy
 
     if file is not None and _is_mission(file):

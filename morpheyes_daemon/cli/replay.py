@@ -24,8 +24,8 @@ def command(
     """Put every recorded observation through the strategy again; exit 1 when a command comes out differently."""
     from dataclasses import asdict
 
-    from morpheyes_daemon.config.packaged import load_mission
     from morpheyes_daemon.recorder.replay import replay
+    from morpheyes_daemon.strategies.missions import load_mission
 
     result = replay(file, load_mission(mission) if mission else None)
     typer.echo(json.dumps({**asdict(result), "same": not result.differences}) if as_json else _page(result))

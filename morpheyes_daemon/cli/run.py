@@ -23,8 +23,9 @@ def command(
     """
     import asyncio
 
-    from morpheyes_daemon.config.packaged import find_mission, load_config, load_mission
+    from morpheyes_daemon.config.packaged import load_config
     from morpheyes_daemon.daemon.service import calibration_file, real_time_runner, serve
+    from morpheyes_daemon.strategies.missions import find_mission, load_mission
 
     vehicle = load_config(config)
     if calibration is not None:

@@ -16,11 +16,11 @@ from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig, VehicleConfig
 from morpheyes_daemon.control.baseline import BaselineModel, FixedBaseline
 from morpheyes_daemon.control.baseline_planner import BaselinePlanner
-from morpheyes_daemon.control.governor import Governor, GovernorLimits
+from morpheyes_daemon.control.governor import Governor
+from morpheyes_daemon.control.limits import governor_limits, velocity_tuning
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.pose_history import VehicleTrack
 from morpheyes_daemon.control.stick_controller import FlightControl
-from morpheyes_daemon.control.velocity import BRAKE_LEAN_RAD, VelocityTuning
 from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
 from morpheyes_daemon.devices.camera import Camera
 from morpheyes_daemon.devices.link import LinkOpener
@@ -31,7 +31,8 @@ from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import Event, MissionCommand, Perception, Track, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, GateOutput, Health, State
-from morpheyes_daemon.perception.pipeline import VisionJob, build_strategy
+from morpheyes_daemon.perception.craft import build_strategy
+from morpheyes_daemon.perception.pipeline import VisionJob
 from morpheyes_daemon.safety.gate import Gate, StickLimits
 from morpheyes_daemon.safety.monitor import Guardian, GuardianLimits
 from morpheyes_daemon.safety.states import Transition
@@ -317,21 +318,5 @@ class Daemon:
             self._parts.tell(report)
 
 
-def velocity_tuning(config: VehicleConfig, model: LoiterModel) -> VelocityTuning:
-    """Return the velocity loop's bounds; without active braking a stop is neutral sticks."""
-    lean_rad = min(math.radians(config.safety.max_lean_deg), model.lean_max_rad)
-    brake_rad = min(BRAKE_LEAN_RAD, lean_rad)
-    stop_rad = brake_rad if config.safety.active_braking else 0.0
-    return VelocityTuning(max_lean_rad=lean_rad, brake_lean_rad=brake_rad, stop_lean_rad=stop_rad)
 
 
-def governor_limits(config: VehicleConfig) -> GovernorLimits:
-    """Return the governor's bounds."""
-    return GovernorLimits(
-        dead_daemon_s=config.safety.dead_daemon_s,
-        depth_sigmas=config.safety.depth_sigmas,
-        max_relative_depth_error=config.safety.max_relative_depth_error,
-        max_speed_m_s=config.safety.max_speed_m_s,
-        sync_error_s=config.camera.sync_error_ms / 1e3,
-        image_width_px=config.camera.width_px,
-    )

@@ -18,6 +18,7 @@ from morpheyes_daemon.clock import Clock, running_clock, wall_time_s
 from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.daemon.composition import Daemon, Parts
 from morpheyes_daemon.daemon.sd_notify import notify
+from morpheyes_daemon.daemon.systemd import SystemdReport
 from morpheyes_daemon.dashboard.server import Dashboard
 from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
 from morpheyes_daemon.devices.camera import build_camera
@@ -29,7 +30,8 @@ from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Health
-from morpheyes_daemon.perception.pipeline import PipelineFactory, fitting_rig
+from morpheyes_daemon.perception.craft import fitting_rig
+from morpheyes_daemon.perception.pipeline import PipelineFactory
 from morpheyes_daemon.recorder.flight_log import flight_header, flight_path
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.stereo.rig import RigModel
@@ -39,11 +41,6 @@ from morpheyes_daemon.vision_worker.process import ProcessWorker
 JOB_TIMEOUT_S = 2.0
 """A frame that takes longer than this is lost, and the worker with it."""
 DASHBOARD_IMAGE_HZ = 2.0
-STICKS_SILENT_S = 1.0
-"""The stick task steps fifty times a second, whatever the state."""
-CAMERA_ALIVE_S = 2.0
-VISION_SILENT_S = 30.0
-"""Longer than it takes to kill a hung vision worker and to start another; killing the daemon for it mends nothing."""
 
 Say = Callable[[str], None]
 
@@ -145,36 +142,8 @@ def ending_by_signal(stop: asyncio.Event) -> Iterator[None]:
             loop.remove_signal_handler(number)
 
 
-class SystemdReport:
-    """READY once, STATUS at every change, WATCHDOG while the chain turns."""
-
-    def __init__(self, send: Callable[[str], bool] = notify) -> None:
-        self._send = send
-        self._status = ""
-
-    def tell(self, report: Health) -> None:
-        """Take a health report, four times a second."""
-        status = f"STATUS={report.state}: {report.reason.text}"
-        words = [] if self._status else ["READY=1"]
-        if status != self._status:
-            self._status = status
-            words.append(status)
-        if chain_turns(report):
-            words.append("WATCHDOG=1")
-        if words:
-            self._send("\n".join(words))
 
 
-def chain_turns(report: Health) -> bool:
-    """Whether what only a restart could mend still works: sticks step, and a living camera leads to depth.
-
-    A device that is away and a vision worker that is being replaced are no reason to be killed, in flight least.
-    """
-    ages = report.ages_s
-    if not ages["gate"] <= STICKS_SILENT_S:
-        return False
-    camera_lives = ages["frame"] <= CAMERA_ALIVE_S
-    return not (camera_lives and ages["perception"] > VISION_SILENT_S)
 
 
 def _heed_calibration(daemon: Daemon, clock: Clock) -> None:

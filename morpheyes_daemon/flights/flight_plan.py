@@ -7,13 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from morpheyes_daemon.calibration.targets.observations import Progress, silent
-from morpheyes_daemon.config.packaged import find_mission, load_config, load_mission
+from morpheyes_daemon.config.packaged import load_config
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.flights.lockstep import FlightPlan, sim_config
 from morpheyes_daemon.flights.sim_vehicle import Scenario
-from morpheyes_daemon.perception.pipeline import fitting_rig
+from morpheyes_daemon.perception.craft import fitting_rig
 from morpheyes_daemon.simulation.worlds.loader import load_world
+from morpheyes_daemon.strategies.missions import find_mission, load_mission
 
 DISPARITIES_OF_PX = 640
 """Width of the images that a number of disparities is said for; smaller images search in proportion."""

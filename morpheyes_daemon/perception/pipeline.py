@@ -14,8 +14,6 @@ import numpy as np
 
 from morpheyes_daemon.clock import stopwatch_s
 from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
-from morpheyes_daemon.config.yaml_errors import validate
-from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.messages.core import (
     DepthMap,
     DepthSummary,
@@ -29,6 +27,7 @@ from morpheyes_daemon.messages.core import (
 )
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.perception.camera_motion import EyeMotion, eye_motion
+from morpheyes_daemon.perception.craft import build_craft, build_strategy
 from morpheyes_daemon.perception.depth_scale_monitor import ScaleWatch, Sight
 from morpheyes_daemon.perception.extrinsics_monitor import Drift, DriftLimits, DriftMonitor
 from morpheyes_daemon.perception.image_checks import (
@@ -41,9 +40,7 @@ from morpheyes_daemon.perception.image_checks import (
 from morpheyes_daemon.stereo.depth import DepthEstimator, RectifiedPair, disparity_of
 from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
 from morpheyes_daemon.stereo.rig import RigModel
-from morpheyes_daemon.strategies.base import Craft, Strategy, View
-from morpheyes_daemon.strategies.registry import find_strategy
-from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rpy, pose
+from morpheyes_daemon.strategies.base import View
 
 _REASONS = {ImageFault.MISALIGNED: Reason.CALIBRATION_DRIFT, ImageFault.APART: Reason.EYES_APART}
 """What is no fault of the images but of the rig."""
@@ -73,40 +70,10 @@ class PipelineFactory:
         return Pipeline(self.config, self.mission, RigModel.load(self.calibration))
 
 
-def fitting_rig(calibration: Path, config: VehicleConfig) -> RigModel:
-    """Return the calibrated rig at the camera's size.
-
-    Raises CalibrationError when it is another camera's, or lacks baselines that the vehicle may be asked for.
-    """
-    rig = RigModel.load(calibration).rescaled(config.camera.width_px, config.camera.height_px)
-    try:
-        for baseline_m in config.baseline_range_m:
-            rig.T_cam0_cam1(baseline_m)
-    except CalibrationError as error:
-        raise CalibrationError(f"{calibration}: {error}") from None
-    return rig
 
 
-def build_craft(config: VehicleConfig) -> Craft:
-    """Return what strategies may know of the vehicle."""
-    mount = config.camera.mount
-    tilt = R_from_rpy(0.0, math.radians(mount.tilt_up_deg), 0.0)
-    position = np.array([mount.forward_mm, mount.right_mm, mount.down_mm]) / 1e3
-    return Craft(
-        footprint=config.footprint,
-        T_frd_rig=pose(tilt @ R_FRD_CAM, position),
-        baseline_range_m=config.baseline_range_m,
-        frame_period_s=1.0 / config.camera.rate_hz,
-        depth_sigmas=config.safety.depth_sigmas,
-        max_relative_depth_error=config.safety.max_relative_depth_error,
-    )
 
 
-def build_strategy(mission: MissionFile, config: VehicleConfig) -> Strategy:
-    """Return the mission's strategy with its checked parameters; raises ConfigError."""
-    kind = find_strategy(mission.strategy)
-    parameters = validate(mission.parameters, kind.Parameters, "parameters", None)
-    return kind(parameters, build_craft(config))
 
 
 class Pipeline:

@@ -15,7 +15,7 @@ from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import MissionCommand, Perception
 from morpheyes_daemon.messages.mission import Observation
-from morpheyes_daemon.perception.pipeline import build_strategy
+from morpheyes_daemon.perception.craft import build_strategy
 from morpheyes_daemon.recorder.encoding import to_plain
 from morpheyes_daemon.recorder.reader import Flight, read_flight, read_header
 from morpheyes_daemon.strategies.base import Strategy

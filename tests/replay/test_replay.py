@@ -16,7 +16,7 @@ from morpheyes_daemon.config.vehicle import MissionFile, SimCameraConfig, Vehicl
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import DepthSummary, FloatMap, Intent, MissionCommand, Perception, VehicleState
 from morpheyes_daemon.messages.mission import Observation
-from morpheyes_daemon.perception.pipeline import build_craft
+from morpheyes_daemon.perception.craft import build_craft
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.replay import replay

@@ -9,11 +9,12 @@ import pytest
 from pydantic import BaseModel
 
 import morpheyes_daemon
-from morpheyes_daemon.config.packaged import load_config, load_mission, mission_names, shipped
+from morpheyes_daemon.config.packaged import load_config, shipped
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.config.yaml_errors import parse_model
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.strategies.missions import load_mission, mission_names
 
 GOOD = "camera: {backend: v4l2}\nservo: {backend: serial}\n"
 

@@ -11,10 +11,11 @@ import pytest
 
 from morpheyes_daemon.calibration.solver.mount import ATTITUDES, MountViews, read_mount_folder, solve_mount, ways_up
 from morpheyes_daemon.calibration.targets.boards import Board
+from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.flights.sim_boards import render_mount_folder
-from morpheyes_daemon.simulation.camera.true_rig import RANGE_M, RigTwin, T_frd_rig
+from morpheyes_daemon.simulation.camera.true_rig import RANGE_M, RigTwin
 from morpheyes_daemon.stereo.rectify import rectify
 from morpheyes_daemon.stereo.rig import EyeMount, RigModel
 from morpheyes_daemon.transforms import Array, R_from_rotvec, rotvec_from_R

@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from morpheyes_daemon.daemon.service import SystemdReport, chain_turns, event_line
+from morpheyes_daemon.daemon.service import event_line
+from morpheyes_daemon.daemon.systemd import SystemdReport, chain_turns
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Health, State

@@ -7,9 +7,9 @@ import math
 import pytest
 
 from morpheyes_daemon.config.vehicle import NoServoConfig, SafetyConfig, SimCameraConfig, VehicleConfig
+from morpheyes_daemon.control.limits import velocity_tuning
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.control.velocity import BRAKE_LEAN_RAD
-from morpheyes_daemon.daemon.composition import velocity_tuning
 from tests.copter_parameters import copter_parameters
 
 

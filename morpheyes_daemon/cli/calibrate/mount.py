@@ -37,7 +37,7 @@ def mount(
     from morpheyes_daemon.cli.calibrate.options import choose_board
     from morpheyes_daemon.cli.progress import progress_line
     from morpheyes_daemon.config.packaged import load_config
-    from morpheyes_daemon.perception.pipeline import build_craft
+    from morpheyes_daemon.perception.craft import build_craft
     from morpheyes_daemon.stereo.rig import RigModel
 
     rig = RigModel.load(file)

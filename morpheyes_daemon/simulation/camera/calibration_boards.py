@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.clock import S
+from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole, RawPair
 from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
-from morpheyes_daemon.simulation.camera.true_rig import RigTwin, T_frd_rig
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.simulation.rendering.renderer import Rendered, Renderer
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.transforms import R_FRD_CAM, Array, R_from_rotvec, inverse, pose

@@ -16,10 +16,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole, RawPair, frozen
 from morpheyes_daemon.simulation.camera.sensor import NOISE, develop
-from morpheyes_daemon.simulation.camera.true_rig import RigTwin, T_frd_rig
+from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.simulation.rendering.renderer import Rendered, Renderer
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.transforms import Array

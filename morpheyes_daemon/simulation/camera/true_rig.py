@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import RigModel
-from morpheyes_daemon.transforms import R_FRD_CAM, Array, R_from_rotvec, R_from_rpy, inverse, pose
+from morpheyes_daemon.transforms import Array, R_from_rotvec, inverse, pose
 
 FOCAL_SHARE = 740.0 / 640.0
 """Focal length over image width: 3.96 mm lens on an OV5647, 56.8 deg diagonal (paper, section III-A)."""
@@ -26,10 +25,6 @@ EXACT_STEPS = 81
 """Baselines in an exact calibration file; between two of them the interpolation errs by less than 1e-4 px."""
 
 
-def T_frd_rig(mount: Mount) -> Array:
-    """Return the pose (4, 4) of the stereo bar (camera axes, midway between the eyes) on the body."""
-    tilt = R_from_rpy(0.0, math.radians(mount.tilt_up_deg), 0.0)
-    return pose(tilt @ R_FRD_CAM, np.array([mount.forward_mm, mount.right_mm, mount.down_mm]) / 1e3)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Footprint, Mount
-from morpheyes_daemon.simulation.camera.true_rig import T_frd_rig
 from morpheyes_daemon.simulation.rendering.meshes import icosphere
 from morpheyes_daemon.simulation.worlds.gjk import BOX, CYLINDER, ELLIPSOID, FRUSTUM, PRISM, nearest
 from morpheyes_daemon.transforms import Array, pose
