@@ -39,8 +39,8 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print rows and cells as JSON and nothing else.")] = False,
 ) -> None:
     """Fly a mission over many seeds in lockstep; continues where it stopped."""
-    from morpheyes_daemon.cli.extras import require_simulator
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.extras import require_simulator
+    from morpheyes_daemon.cli.terminal.progress import progress_line
 
     require_simulator()
     from morpheyes_daemon.campaigns.results import RESULTS

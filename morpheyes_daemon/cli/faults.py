@@ -26,7 +26,7 @@ def command(
     Exit code 0 when every fault ended as the table says, 1 when one did not, 2 on wrong usage.
     """
     from morpheyes_daemon.campaigns.runner import parse_seeds
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.fault_injection.report import page
     from morpheyes_daemon.fault_injection.runner import Row, choose, flights, load_rows, run_matrix, store_row
     from morpheyes_daemon.flights.flight_plan import make_plan

@@ -49,8 +49,8 @@ def command(
 
     Exit code 0 when the goal was reached (or a gap rightly refused), 1 when not, 2 on wrong usage.
     """
-    from morpheyes_daemon.cli.extras import require_simulator
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.extras import require_simulator
+    from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.errors import UsageError
 
     if autopilot is not None and not re.fullmatch(r"tcp:[^:/]+:\d+", autopilot):
@@ -85,7 +85,7 @@ def command(
 
 
 def _fly_lockstep(plan: FlightPlan, folder: Path, quiet: bool) -> Summary:
-    from morpheyes_daemon.cli.flight_line import FlightLine
+    from morpheyes_daemon.cli.terminal.flight_line import FlightLine
     from morpheyes_daemon.flights.artifacts import FlightOutputs
     from morpheyes_daemon.flights.lockstep import Watchers, fly
 
@@ -101,7 +101,7 @@ def _fly_lockstep(plan: FlightPlan, folder: Path, quiet: bool) -> Summary:
 
 
 def _fly_realtime(plan: FlightPlan, folder: Path, autopilot: str | None, quiet: bool) -> Summary:
-    from morpheyes_daemon.cli.flight_line import FlightLine
+    from morpheyes_daemon.cli.terminal.flight_line import FlightLine
     from morpheyes_daemon.flights.realtime import fly_realtime
 
     with FlightLine(quiet) as line:

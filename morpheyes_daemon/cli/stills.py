@@ -24,8 +24,8 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the comparison as JSON and nothing else.")] = False,
 ) -> None:
     """Render stereo pairs with Mitsuba's path tracer and with the fast renderer, and compare their depth."""
-    from morpheyes_daemon.cli.extras import require_figures, require_simulator
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.extras import require_figures, require_simulator
+    from morpheyes_daemon.cli.terminal.progress import progress_line
 
     require_simulator()
     require_figures()

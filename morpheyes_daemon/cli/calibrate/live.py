@@ -100,7 +100,7 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Check a calibration on any scene that holds still, without a board: rows at every baseline, and the yaw."""
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.stereo.rig import RigModel
 
     rig = RigModel.load(file)
@@ -134,7 +134,7 @@ def repeatability(
     from morpheyes_daemon.calibration.targets.detection import observe
     from morpheyes_daemon.calibration.targets.image_pairs import read_folder
     from morpheyes_daemon.cli.calibrate.options import choose_board
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.stereo.rig import RigModel
 
     rig = RigModel.load(file)

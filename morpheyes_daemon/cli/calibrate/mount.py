@@ -35,7 +35,7 @@ def mount(
     from morpheyes_daemon.calibration.solver.mount import read_mount_folder, solve_mount, ways_up
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file
     from morpheyes_daemon.cli.calibrate.options import choose_board
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.config.packaged import load_config
     from morpheyes_daemon.perception.craft import build_craft
     from morpheyes_daemon.stereo.rig import RigModel

@@ -42,7 +42,7 @@ def solve(
     import datetime
 
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file, solve_folder
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.clock import wall_time_s
 
     known = read_board_file(folder) if folder.is_dir() else {}
@@ -97,7 +97,7 @@ def render(
     """Render boards before the simulator's camera, as folders that `solve` takes."""
     from morpheyes_daemon.calibration.solver.mount import MOUNT_VIEWS
     from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.flights.sim_boards import (
         DEFAULT_BOARD,
         render_folder,
@@ -134,7 +134,7 @@ def evaluate(
 ) -> None:
     """Compare a solved file with the truth of the simulator's rig, at 41 baselines."""
     from morpheyes_daemon.benchmarks.calibration_error import compare_separate, evaluate_rig, twin_of
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.stereo.rig import RigModel
 
     rig = RigModel.load(file)
@@ -148,7 +148,7 @@ def evaluate(
         with progress_line() as progress:
             figures["at_calibrated_baselines"] = compare_separate(separate, chosen, rig, twin, progress)
     if watch:
-        from morpheyes_daemon.cli.extras import require_simulator
+        from morpheyes_daemon.cli.terminal.extras import require_simulator
 
         require_simulator()
         from morpheyes_daemon.benchmarks.online_calibration import watch_figures

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from morpheyes_daemon.cli.bench_gap import gap, gap_images
-from morpheyes_daemon.cli.figures import say, times_text
-from morpheyes_daemon.cli.progress import progress_line
+from morpheyes_daemon.cli.bench.gap import gap, gap_images
+from morpheyes_daemon.cli.terminal.figures import say, times_text
+from morpheyes_daemon.cli.terminal.progress import progress_line
 
 if TYPE_CHECKING:
     from morpheyes_daemon.flights.lockstep import FlightPlan, Progress
@@ -182,7 +182,7 @@ def _plan(size: str, calibration: str, rate_hz: float, minutes: float) -> Flight
 
 
 def _live(quiet: bool, run: Callable[[Callable[[Progress], None]], Any]) -> Any:
-    from morpheyes_daemon.cli.flight_line import FlightLine
+    from morpheyes_daemon.cli.terminal.flight_line import FlightLine
 
     with FlightLine(quiet) as line:
         return run(line.show)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from morpheyes_daemon.cli.figures import say, times_text
+from morpheyes_daemon.cli.terminal.figures import say, times_text
 
 
 def gap(
@@ -20,8 +20,8 @@ def gap(
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON and nothing else.")] = False,
 ) -> None:
     """Time gap detection on one core, with and without depth, beside a detector by stacked optical flow."""
-    from morpheyes_daemon.cli.extras import require_simulator
-    from morpheyes_daemon.cli.progress import progress_line
+    from morpheyes_daemon.cli.terminal.extras import require_simulator
+    from morpheyes_daemon.cli.terminal.progress import progress_line
 
     require_simulator()
     from morpheyes_daemon.benchmarks.gap_detection import bench_gap

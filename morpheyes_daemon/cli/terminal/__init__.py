@@ -1,0 +1,1 @@
+"""What commands share: progress, figures, optional extras, the line of a flight."""
