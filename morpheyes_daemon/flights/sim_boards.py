@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import yaml
 
-from morpheyes_daemon.calibration.solver.mount import ATTITUDES, COLUMNS, MOUNT_VIEWS, MountViews, board_rotation
+from morpheyes_daemon.calibration.mount import ATTITUDES, COLUMNS, MOUNT_VIEWS, MountViews, board_rotation
 from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners
 from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
 from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from morpheyes_daemon.calibration.solver.mount import solve_mount, ways_up
+from morpheyes_daemon.calibration.mount import solve_mount, ways_up
 from morpheyes_daemon.calibration.solver.result import rig_model
 from morpheyes_daemon.calibration.solver.solver import calibrate
 from morpheyes_daemon.calibration.targets.observations import Progress, silent

@@ -17,7 +17,7 @@ from typing import Self
 import numpy as np
 
 from morpheyes_daemon.bus import EventLog, Topics
-from morpheyes_daemon.calibration.solver.mount import ATTITUDES, COLUMNS, attitude_rows
+from morpheyes_daemon.calibration.mount import ATTITUDES, COLUMNS, attitude_rows
 from morpheyes_daemon.calibration.targets.boards import Board, find_corners
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config.vehicle import VehicleConfig

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.solver.mount import ATTITUDES, MountViews, read_mount_folder, solve_mount, ways_up
+from morpheyes_daemon.calibration.mount import ATTITUDES, MountViews, read_mount_folder, solve_mount, ways_up
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount

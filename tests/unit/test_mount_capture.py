@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.solver.mount import ATTITUDES, attitude_rows
+from morpheyes_daemon.calibration.mount import ATTITUDES, attitude_rows
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import RawPair, VehicleState

@@ -49,7 +49,7 @@ def capture(
     """
     import asyncio
 
-    from morpheyes_daemon.calibration.solver.mount import MOUNT_VIEWS
+    from morpheyes_daemon.calibration.mount import MOUNT_VIEWS
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file
     from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
     from morpheyes_daemon.cli.calibrate.options import choose_baselines_m, choose_board

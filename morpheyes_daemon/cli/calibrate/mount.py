@@ -13,7 +13,7 @@ import typer
 from morpheyes_daemon.cli.calibrate.options import BoardOption, ConfigOption, JsonOption, MarkerOption, SquareOption
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.calibration.solver.mount import MountSolution, MountViews
+    from morpheyes_daemon.calibration.mount import MountSolution, MountViews
 
 
 def mount(
@@ -32,7 +32,7 @@ def mount(
     """
     from dataclasses import replace
 
-    from morpheyes_daemon.calibration.solver.mount import read_mount_folder, solve_mount, ways_up
+    from morpheyes_daemon.calibration.mount import read_mount_folder, solve_mount, ways_up
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file
     from morpheyes_daemon.cli.calibrate.options import choose_board
     from morpheyes_daemon.cli.terminal.progress import progress_line

@@ -95,7 +95,7 @@ def render(
     marker_mm: MarkerOption = None,
 ) -> None:
     """Render boards before the simulator's camera, as folders that `solve` takes."""
-    from morpheyes_daemon.calibration.solver.mount import MOUNT_VIEWS
+    from morpheyes_daemon.calibration.mount import MOUNT_VIEWS
     from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
     from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.flights.sim_boards import (
