@@ -12,7 +12,7 @@ from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.airframe.wind import WindConditions
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
-from tests.hand_clock import HandClock
+from tests.support.hand_clock import HandClock
 
 RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 50,

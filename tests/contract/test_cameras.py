@@ -30,8 +30,8 @@ from morpheyes_daemon.errors import (
 )
 from morpheyes_daemon.messages.core import Image, RawPair
 from morpheyes_daemon.simulation.camera.frame_server import FrameServer
-from tests.hand_clock import HandClock
-from tests.real_images import real_images
+from tests.support.hand_clock import HandClock
+from tests.support.real_images import real_images
 
 W, H = 160, 120
 

@@ -22,8 +22,8 @@ from morpheyes_daemon.errors import DeviceNotFoundError
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Health, State
-from tests.hand_clock import HandClock
-from tests.synthetic_flight import SyntheticFlight
+from tests.support.hand_clock import HandClock
+from tests.support.synthetic_flight import SyntheticFlight
 
 
 class Bench:

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
+from tests.unit.test_doctor_parameters import BAD
 
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config.vehicle import AutopilotConfig, NoServoConfig, SimCameraConfig, VehicleConfig
@@ -17,8 +18,7 @@ from morpheyes_daemon.doctor.takeover import HandOver, TakeoverTest
 from morpheyes_daemon.doctor.vehicle import VehicleExamination
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.simulation.autopilot.parameters import RECOMMENDED
-from tests.hub_bench import HubBench
-from tests.unit.test_doctor_parameters import BAD
+from tests.support.hub_bench import HubBench
 
 
 def config(**autopilot: object) -> VehicleConfig:

@@ -22,7 +22,7 @@ from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame
 from morpheyes_daemon.vision_worker.inline import InlineWorker, WorkerFailed, WorkerLost
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 from morpheyes_daemon.vision_worker.shared_memory import Mailbox
-from tests.scapegoat import Order, Scapegoat, dies_building, never_built
+from tests.support.scapegoat import Order, Scapegoat, dies_building, never_built
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the worker needs Unix sockets")
 
@@ -208,7 +208,7 @@ def _open_fds() -> list[str]:
 
 ORPHAN = """
 import asyncio, os, signal
-from tests.scapegoat import Order, Scapegoat
+from tests.support.scapegoat import Order, Scapegoat
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 
 async def main():

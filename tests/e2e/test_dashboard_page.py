@@ -12,8 +12,8 @@ from morpheyes_daemon.dashboard.server import Dashboard
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Health, State
-from tests.hand_clock import HandClock
-from tests.synthetic_flight import SyntheticFlight
+from tests.support.hand_clock import HandClock
+from tests.support.synthetic_flight import SyntheticFlight
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 ARGUMENTS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]

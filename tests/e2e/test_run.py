@@ -27,8 +27,8 @@ from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.autopilot.tcp_server import MavlinkServer
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
-from tests.fixed_rig import fixed_rig
-from tests.real_images import real_images
+from tests.support.fixed_rig import fixed_rig
+from tests.support.real_images import real_images
 
 WIDTH, HEIGHT = 320, 240
 BASELINE_MM = 65.0

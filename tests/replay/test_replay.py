@@ -22,7 +22,7 @@ from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.replay import replay
 from morpheyes_daemon.strategies.base import Strategy, StrategyParameters
 from morpheyes_daemon.strategies.registry import BUILT_IN
-from tests.hand_clock import HandClock
+from tests.support.hand_clock import HandClock
 
 STEPS = 25
 

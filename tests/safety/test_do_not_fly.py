@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.unit.test_doctor_parameters import BAD
 
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config.vehicle import NoServoConfig, SerialServoConfig
@@ -11,8 +12,7 @@ from morpheyes_daemon.doctor.findings import Severity
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
-from tests.noisy_daemon import NoisyDaemon
-from tests.unit.test_doctor_parameters import BAD
+from tests.support.noisy_daemon import NoisyDaemon
 
 DANGEROUS = [
     (*changes.popitem(), finding)

@@ -20,7 +20,7 @@ from morpheyes_daemon.safety.monitor import (
     GuardianLimits,
 )
 from morpheyes_daemon.safety.states import EFFECTS, HOLDING, Trigger
-from tests.cockpit import LIMITS, OFF_US, ON_US, OTHER_LIMITS, Actor, Cockpit
+from tests.support.cockpit import LIMITS, OFF_US, ON_US, OTHER_LIMITS, Actor, Cockpit
 
 AT_REST_M_S, IDLE_S, PAUSE_S = 0.15, 1.0, 0.5
 OUTSIDE = [state for state in State if state not in HOLDING]

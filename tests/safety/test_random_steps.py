@@ -16,7 +16,7 @@ from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import GuardianLimits
-from tests.cockpit import HEALTHY, LIMITS, OFF_US, ON_US, OTHER_LIMITS, Cockpit
+from tests.support.cockpit import HEALTHY, LIMITS, OFF_US, ON_US, OTHER_LIMITS, Cockpit
 
 OURS = (Lease.SUPERVISOR, Lease.FRAME, Lease.DEPTH, Lease.MISSION)
 WILD = (math.nan, math.inf, -math.inf, 1e300, -1e9, 0.0, 65535.0, 1500.5, -1500.0)

@@ -14,7 +14,7 @@ from morpheyes_daemon.messages.safety import Action, State
 from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import GuardianLimits
 from morpheyes_daemon.safety.states import EFFECTS, HOLDING
-from tests.cockpit import HEALTHY, LIMITS, OFF_US, ON_US, OTHER_LIMITS, Cockpit
+from tests.support.cockpit import HEALTHY, LIMITS, OFF_US, ON_US, OTHER_LIMITS, Cockpit
 
 widths = st.floats() | st.integers(-(10**9), 10**9) | st.sampled_from((0.0, 1000.0, 1900.0, 65535.0))
 leases = st.sampled_from(list(Lease))

@@ -12,7 +12,7 @@ from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, State
 from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.states import HOLDING
-from tests.cockpit import OFF_US, ON_US, Cockpit
+from tests.support.cockpit import OFF_US, ON_US, Cockpit
 
 WAYS: dict[str, tuple[Callable[[Cockpit], None], State, Reason]] = {
     "switch": (lambda cockpit: cockpit.rc(OFF_US), State.RELEASED, Reason.SWITCH_OFF),

@@ -15,7 +15,7 @@ from morpheyes_daemon.devices.link import MemoryLink
 from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.crew.scripted import GroundCrew
 from morpheyes_daemon.wire.mavlink import ChannelOverride
-from tests.hub_bench import HubBench
+from tests.support.hub_bench import HubBench
 
 HEIGHT_M = 2.4
 ESTIMATOR_M_S = 0.1
