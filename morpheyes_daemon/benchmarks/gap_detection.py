@@ -21,8 +21,8 @@ from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages.core import BaselineEstimate, Image, RawPair, StereoFrame, VehicleState
 from morpheyes_daemon.perception.craft import build_strategy
 from morpheyes_daemon.simulation.worlds.world import GapTruth
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.stereo.depth import DepthEstimator, grey
-from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import View
 from morpheyes_daemon.strategies.gap.perception import GapPercept
 from morpheyes_daemon.transforms import Array, pose
@@ -73,7 +73,7 @@ class GapBencher:
 
     def __init__(self, plan: FlightPlan) -> None:
         size = (plan.config.camera.width_px, plan.config.camera.height_px)
-        self._estimator = DepthEstimator(RigModel.load(plan.calibration), plan.config.stereo, size)
+        self._estimator = DepthEstimator(read_calibration(plan.calibration), plan.config.stereo, size)
         self._strategy = build_strategy(plan.mission, plan.config)
         self.seconds: dict[str, list[float]] = {"detection": [], "detection_cpu": [], "depth": [], "flow": []}
         self.ious: dict[str, list[float]] = {"detection": [], "flow": []}

@@ -18,8 +18,8 @@ from morpheyes_daemon.flights.lockstep import FlightPlan
 from morpheyes_daemon.flights.sim_vehicle import Stage
 from morpheyes_daemon.messages.core import BaselineEstimate, Perception, RawPair, StereoFrame, VehicleState
 from morpheyes_daemon.perception.pipeline import PipelineFactory, VisionJob
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.stereo.depth import DepthEstimator
-from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import Array, pose
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 
@@ -109,7 +109,7 @@ def bench_render(plan: FlightPlan, repeats: int, report: Report) -> Times:
 def bench_depth(plan: FlightPlan, repeats: int, report: Report) -> DepthBench:
     """Time our depth map and OpenCV's matcher with the same search range, in turns."""
     width, height = plan.config.camera.width_px, plan.config.camera.height_px
-    estimator = DepthEstimator(RigModel.load(plan.calibration), plan.config.stereo, (width, height))
+    estimator = DepthEstimator(read_calibration(plan.calibration), plan.config.stereo, (width, height))
     disparities = -(-round(plan.config.stereo.disparities_fraction * width) // 16) * 16
     matcher = opencv_matcher(disparities)
     ours, theirs = [], []

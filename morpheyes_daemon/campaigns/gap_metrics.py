@@ -18,8 +18,8 @@ from morpheyes_daemon.messages.core import Perception, StereoFrame
 from morpheyes_daemon.messages.safety import GateOutput, State
 from morpheyes_daemon.simulation.worlds.gap_world import GapWorld, drawn_shape
 from morpheyes_daemon.simulation.worlds.loader import load_world
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.stereo.rectify import Rectifier
-from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.gap.perception import GapPercept
 from morpheyes_daemon.transforms import Array, inverse, rpy_from_R
 
@@ -37,7 +37,7 @@ class GapMeasures:
 
     def __init__(self, plan: FlightPlan) -> None:
         size = (plan.config.camera.width_px, plan.config.camera.height_px)
-        self._rectifier = Rectifier(RigModel.load(plan.calibration), size)
+        self._rectifier = Rectifier(read_calibration(plan.calibration), size)
         self._plan = plan
         self._frames: dict[int, StereoFrame] = {}
         self._ious: list[float] = []

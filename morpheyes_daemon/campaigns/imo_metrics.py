@@ -21,8 +21,8 @@ from morpheyes_daemon.messages.core import Perception, Pinhole, StereoFrame, Tra
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.simulation.worlds.loader import load_world
 from morpheyes_daemon.simulation.worlds.room_world import RoomWorld
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.stereo.rectify import Rectifier
-from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.imo.strategy import ImoPercept
 from morpheyes_daemon.transforms import Array, inverse, pose
 
@@ -60,7 +60,7 @@ class ImoMeasures:
 
     def __init__(self, plan: FlightPlan) -> None:
         size = (plan.config.camera.width_px, plan.config.camera.height_px)
-        self._rectifier = Rectifier(RigModel.load(plan.calibration), size)
+        self._rectifier = Rectifier(read_calibration(plan.calibration), size)
         world = load_world(plan.scenario.world).world
         room = world if isinstance(world, RoomWorld) else None
         self._edge_m = room.cube.edge_mm / 1e3 if room and room.cube else 0.0

@@ -25,7 +25,7 @@ from morpheyes_daemon.flights.artifacts import FlightOutputs
 from morpheyes_daemon.flights.flight_plan import hold, parse_baseline, with_seed
 from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
 from morpheyes_daemon.simulation.worlds.loader import load_world
-from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 
 FLIGHTS = "flights.jsonl"
 
@@ -66,7 +66,7 @@ class Campaign:
             "latency_ms": stereo.latency_ms,
             "disparities_fraction": stereo.disparities_fraction,
             "wind_m_s": plan.scenario.wind_m_s,
-            "calibration": RigModel.load(plan.calibration).origin,
+            "calibration": read_calibration(plan.calibration).origin,
             "seeds": [self.seeds[0], self.seeds[-1]],
             "baselines": list(self.baselines),
         }
@@ -164,7 +164,7 @@ def fly_one(plan: FlightPlan, key: str, folder: Path | None = None) -> Row:
 def _try_one(mode: str, plan: FlightPlan, key: str, folder: Path | None = None) -> Row | Failure:
     try:
         return fly_one(plan, key, folder)
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 -- the worker's task boundary
         return Failure(mode, plan.scenario.seed, mistake(error))
 
 
@@ -228,7 +228,7 @@ def _fly_on(scheduler: str, plans: Sequence[tuple[str, FlightPlan]], key: str) -
         for flight in as_completed(flights):  # type: ignore[no-untyped-call]
             try:
                 flown = flight.result()
-            except Exception as error:
+            except Exception as error:  # noqa: BLE001 -- whatever became of a worker
                 flown = Failure(*flights[flight], f"{type(error).__name__}: {error}")
             flight.release()  # or a worker that dies has all that it ever flew flown again
             yield flown

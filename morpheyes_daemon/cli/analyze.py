@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from morpheyes_daemon.stereo.calibration_file import read_calibration
+
 
 def command(
     rig: Annotated[Path | None, typer.Option(help="Calibration file to analyse instead of the paper's rig.")] = None,
@@ -19,9 +21,8 @@ def command(
     from morpheyes_daemon.errors import InputError
     from morpheyes_daemon.paper.error_analysis import analysis, paper_subject, rig_subject
     from morpheyes_daemon.paper.figures import draw_all
-    from morpheyes_daemon.stereo.rig import RigModel
 
-    subject = paper_subject() if rig is None else rig_subject(RigModel.load(rig), rig.name)
+    subject = paper_subject() if rig is None else rig_subject(read_calibration(rig), rig.name)
     numbers = analysis(subject)
     text = json.dumps(numbers, indent=2, allow_nan=False)
     try:

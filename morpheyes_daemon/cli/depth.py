@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from morpheyes_daemon.errors import UsageError
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 
 
 def command(
@@ -26,7 +27,6 @@ def command(
 
     from morpheyes_daemon.clock import stopwatch_s
     from morpheyes_daemon.stereo.image_files import read_pair, write_depth
-    from morpheyes_daemon.stereo.rig import RigModel
     from morpheyes_daemon.stereo.still import raw_depth, rectified_depth
 
     _require_positive(**{"--focal-px": focal_px, "--baseline-m": baseline_m, "--near-m": near_m})
@@ -34,7 +34,7 @@ def command(
         raise UsageError("--calibration knows the focal length and the offset; leave out --focal-px and --doffs-px.")
     pair = read_pair(left, right)
     if calibration is not None:
-        rig = RigModel.load(calibration)
+        rig = read_calibration(calibration)
         started_s = stopwatch_s()
         depth = raw_depth(*pair, rig, baseline_m, near_m)
     elif focal_px is not None and baseline_m is not None:

@@ -34,7 +34,7 @@ from morpheyes_daemon.perception.craft import fitting_rig
 from morpheyes_daemon.perception.pipeline import PipelineFactory
 from morpheyes_daemon.recorder.flight_log import flight_header, flight_path
 from morpheyes_daemon.recorder.recorder import Recorder
-from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.stereo.calibration_file import calibration_hash, read_calibration
 from morpheyes_daemon.supervisor.supervisor import Pulse, Task
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 
@@ -162,7 +162,7 @@ def _recorder(daemon: Daemon, mission_name: str, mission: MissionFile, clock: Cl
         mission=mission_name,
         mission_file=mission,
         config=config,
-        calibration_hash=RigModel.load(calibration_file(config)).hash,
+        calibration_hash=calibration_hash(read_calibration(calibration_file(config))),
         wall_s=wall_time_s(),
     )
     return Recorder(

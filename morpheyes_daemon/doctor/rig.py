@@ -17,6 +17,7 @@ from morpheyes_daemon.devices.servo import Servo
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.errors import CalibrationError, ConfigError, DeviceError, InputError, MorphEyesError
 from morpheyes_daemon.messages.core import BaselineEstimate, RawPair, StereoFrame
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.stereo.depth import DepthEstimator
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.theory.sync import sync_speed_bound_m_s
@@ -37,7 +38,7 @@ def examine_calibration(config: VehicleConfig) -> tuple[list[Finding], RigModel 
     if config.calibration is None:
         return [_unusable("calibration is not set in config.yaml")], None
     try:
-        rig = RigModel.load(config.calibration).rescaled(config.camera.width_px, config.camera.height_px)
+        rig = read_calibration(config.calibration).rescaled(config.camera.width_px, config.camera.height_px)
         for baseline_m in config.baseline_range_m:
             rig.T_cam0_cam1(baseline_m)
     except (CalibrationError, ConfigError) as error:

@@ -160,7 +160,7 @@ async def _report(flight: FaultFlight, state: State, fault: Fault) -> dict[str, 
     """Try one fault in a process of its own; whatever happens there is a row."""
     try:
         row = await _try(flight, state, fault)
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 -- the whole life of a process
         row = make_row(fault, state, flight.plan.scenario.seed, None, (mistake(error),))
     return asdict(row)
 

@@ -22,7 +22,7 @@ from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.series import FlightSeries
 from morpheyes_daemon.simulation.worlds.loader import World
 from morpheyes_daemon.simulation.worlds.world import GapTruth
-from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.stereo.calibration_file import calibration_hash, read_calibration
 from morpheyes_daemon.transforms import inverse
 
 FILES = ("summary.json", "flight.mcap", "map.png", "strips.png", "flight.mp4")
@@ -105,7 +105,7 @@ class FlightOutputs:
             mission=plan.mission_name,
             mission_file=plan.mission,
             config=plan.config,
-            calibration_hash=RigModel.load(plan.calibration).hash,
+            calibration_hash=calibration_hash(read_calibration(plan.calibration)),
             wall_s=wall_time_s(),
             scene=self._scene.as_json(),
         )

@@ -14,6 +14,7 @@ from morpheyes_daemon.flights.lockstep import FlightPlan, sim_config
 from morpheyes_daemon.flights.sim_vehicle import Scenario
 from morpheyes_daemon.perception.craft import fitting_rig
 from morpheyes_daemon.simulation.worlds.loader import load_world
+from morpheyes_daemon.stereo.calibration_file import write_calibration
 from morpheyes_daemon.strategies.missions import find_mission, load_mission
 
 DISPARITIES_OF_PX = 640
@@ -117,6 +118,6 @@ def calibration_file(kind: str, progress: Progress = silent) -> Path:
 
         path = cache_folder("calibration") / "exact.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
-        RigTwin(640, 480, 0).exact_rig().save(path)
+        write_calibration(RigTwin(640, 480, 0).exact_rig(), path)
         return path
     return Path(kind)

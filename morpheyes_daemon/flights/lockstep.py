@@ -35,7 +35,7 @@ from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import GateOutput, State
 from morpheyes_daemon.perception.pipeline import PipelineFactory
 from morpheyes_daemon.simulation.crew.scripted import GroundCrew
-from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.vision_worker.inline import InlineWorker
 
 AUTOPILOT_URL = "memory:autopilot"
@@ -287,7 +287,7 @@ def summarize_flight(
         mission=plan.mission_name,
         seed=plan.scenario.seed,
         baseline_mode="variable" if hold_mm is None else f"{hold_mm / 1e3:g}",
-        calibration=RigModel.load(plan.calibration).origin,
+        calibration=read_calibration(plan.calibration).origin,
         outcome=verdict.outcome,
         reason=verdict.reason,
         text=tally.said(verdict.reason),

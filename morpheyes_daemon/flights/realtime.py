@@ -35,7 +35,7 @@ from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.reader import read_flight
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.report import draw_report
-from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.stereo.calibration_file import calibration_hash, read_calibration
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 
 READY_LIMIT_S = 600.0
@@ -251,7 +251,7 @@ def _recorder(plan: FlightPlan, config: VehicleConfig, daemon: Daemon, log: Path
         mission=plan.mission_name,
         mission_file=plan.mission,
         config=config,
-        calibration_hash=RigModel.load(plan.calibration).hash,
+        calibration_hash=calibration_hash(read_calibration(plan.calibration)),
         wall_s=wall_time_s(),
         scene=scene_json,
     )

@@ -14,6 +14,7 @@ from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.flights.sim_boards import DEFAULT_BOARD, observe_mount, observe_twin, twin_name
 from morpheyes_daemon.simulation.rendering.texture_cache import cache_folder
+from morpheyes_daemon.stereo.calibration_file import read_calibration, write_calibration
 from morpheyes_daemon.stereo.rig import RigModel
 
 _SIZE = (640, 480)
@@ -30,7 +31,7 @@ def solved_rig_file(seed: int, cache_dir: Path | None = None, progress: Progress
     folder = cache_folder("calibration") if cache_dir is None else cache_dir
     path = folder / f"{twin_name(seed, _SIZE)}-v{_METHOD}.yaml"
     if not _readable(path):
-        solve_twin(seed, progress).save(path)
+        write_calibration(solve_twin(seed, progress), path)
     return path
 
 
@@ -39,9 +40,9 @@ def mounted_rig_file(seed: int, cache_dir: Path | None = None, progress: Progres
     solved = solved_rig_file(seed, cache_dir, progress)
     path = solved.with_name(f"{solved.stem}-mounted-v{_MOUNT_METHOD}.yaml")
     if not _readable(path):
-        rig = RigModel.load(solved)
+        rig = read_calibration(solved)
         found = solve_mount(observe_mount(seed, rig.cam0, progress), T_frd_rig(Mount())[:3, :3], ways_up(DEFAULT_BOARD))
-        replace(rig, mount=found.mount).save(path)
+        write_calibration(replace(rig, mount=found.mount), path)
     return path
 
 
@@ -59,7 +60,7 @@ def _readable(path: Path) -> bool:
     if not path.is_file():
         return False
     try:
-        RigModel.load(path)
+        read_calibration(path)
     except CalibrationError:
         return False
     return True

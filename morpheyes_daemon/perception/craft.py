@@ -10,6 +10,7 @@ import numpy as np
 from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.config.yaml_errors import validate
 from morpheyes_daemon.errors import CalibrationError
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import Craft, Strategy
 from morpheyes_daemon.strategies.registry import find_strategy
@@ -21,7 +22,7 @@ def fitting_rig(calibration: Path, config: VehicleConfig) -> RigModel:
 
     Raises CalibrationError when it is another camera's, or lacks baselines that the vehicle may be asked for.
     """
-    rig = RigModel.load(calibration).rescaled(config.camera.width_px, config.camera.height_px)
+    rig = read_calibration(calibration).rescaled(config.camera.width_px, config.camera.height_px)
     try:
         for baseline_m in config.baseline_range_m:
             rig.T_cam0_cam1(baseline_m)

@@ -37,6 +37,7 @@ from morpheyes_daemon.perception.image_checks import (
     exposure_faults,
     matching_faults,
 )
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.stereo.depth import DepthEstimator, RectifiedPair, disparity_of
 from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
 from morpheyes_daemon.stereo.rig import RigModel
@@ -67,7 +68,7 @@ class PipelineFactory:
     calibration: Path
 
     def __call__(self) -> Pipeline:
-        return Pipeline(self.config, self.mission, RigModel.load(self.calibration))
+        return Pipeline(self.config, self.mission, read_calibration(self.calibration))
 
 
 

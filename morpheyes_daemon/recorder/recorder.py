@@ -171,7 +171,7 @@ class Recorder:
         while not self._stop.wait(DRAIN_S):
             try:
                 self._drain()
-            except Exception as error:
+            except Exception as error:  # noqa: BLE001 -- the thread's boundary: a strange value must not end the log
                 _log.exception("recorder")
                 self._report_failure(str(error))
         self._finish()

@@ -128,6 +128,11 @@ def document(rig: RigModel) -> dict[str, Any]:
     }
 
 
+def calibration_hash(rig: RigModel) -> str:
+    """Return the SHA-256 (hex) that the file of `rig` carries."""
+    return content_hash(document(rig))
+
+
 def content_hash(content: Mapping[str, Any]) -> str:
     """Return the SHA-256 (hex) of plain data in canonical JSON, whatever the order of its keys."""
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), default=str)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from morpheyes_daemon.config.vehicle import StereoConfig
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import DepthMap, FloatMap, Image, StereoFrame, frozen
+from morpheyes_daemon.stereo.calibration_file import calibration_hash
 from morpheyes_daemon.stereo.matching import Match, MatchSettings, disparity_range, match
 from morpheyes_daemon.stereo.rectify import Rectification, Rectifier
 from morpheyes_daemon.stereo.rig import RigModel
@@ -45,7 +46,7 @@ class DepthEstimator:
         settings: MatchSettings | None = None,
     ) -> None:
         self.rectifier = Rectifier(rig, size)
-        self.calibration_hash = rig.hash
+        self.calibration_hash = calibration_hash(rig)
         self.config = config or StereoConfig()
         self.settings = settings or default_settings(self.rig.size[1])
 

@@ -13,7 +13,6 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,26 +111,6 @@ class RigModel:
         pairs = zip(nominal_m, T_cam0_cam1, strict=True)
         baselines = tuple(CalibratedBaseline.from_pose(nominal, T) for nominal, T in pairs)
         return cls(cam0, cam1, baselines, method, details or {})
-
-    @classmethod
-    def load(cls, path: Path) -> RigModel:
-        """Read a calibration file; raises CalibrationError naming the file and the remedy."""
-        from morpheyes_daemon.stereo.calibration_file import read_calibration
-
-        return read_calibration(path)
-
-    def save(self, path: Path) -> None:
-        """Write the calibration file, whole or not at all."""
-        from morpheyes_daemon.stereo.calibration_file import write_calibration
-
-        write_calibration(self, path)
-
-    @cached_property
-    def hash(self) -> str:
-        """SHA-256 of the file's canonical content: the same rig has the same hash, saved or not."""
-        from morpheyes_daemon.stereo.calibration_file import content_hash, document
-
-        return content_hash(document(self))
 
     @property
     def size(self) -> tuple[int, int]:

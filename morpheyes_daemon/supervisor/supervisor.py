@@ -94,7 +94,7 @@ class Supervisor:
                 text = f"{task.name}: ended unexpectedly"
             except MorphEyesError as error:
                 text = f"{task.name}: {error}"
-            except Exception as error:
+            except Exception as error:  # noqa: BLE001 -- the task boundary
                 text = f"{task.name}: {mistake(error)}"
             self._report(task, pulse, text)
             backoff_s = FIRST_BACKOFF_S if pulse.count > beats else min(LAST_BACKOFF_S, backoff_s * 2)

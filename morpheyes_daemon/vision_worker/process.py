@@ -305,7 +305,7 @@ def _reply(link: socket.socket, results: Mailbox, work: Callable[[], Any]) -> No
     try:
         results.put(work())
         verdict = _Verdict.DONE
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 -- the worker's task boundary
         told = isinstance(error, MorphEyesError)
         results.put(error if told else (mistake(error), traceback.format_exc()))
         verdict = _Verdict.FAILED

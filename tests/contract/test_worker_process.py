@@ -22,7 +22,7 @@ from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame
 from morpheyes_daemon.vision_worker.inline import InlineWorker, WorkerFailed, WorkerLost
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 from morpheyes_daemon.vision_worker.shared_memory import Mailbox
-from tests.support.scapegoat import Order, Scapegoat, dies_building, never_built
+from tests.safety.scapegoat import Order, Scapegoat, dies_building, never_built
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the worker needs Unix sockets")
 
@@ -48,7 +48,7 @@ def gone(pid: int) -> bool:
 
 async def until(condition: Callable[[], bool]) -> None:
     """Wait for another process; there is nothing to be notified by."""
-    while not condition():
+    while not condition():  # noqa: ASYNC110
         await asyncio.sleep(0.01)
 
 
@@ -208,7 +208,7 @@ def _open_fds() -> list[str]:
 
 ORPHAN = """
 import asyncio, os, signal
-from tests.support.scapegoat import Order, Scapegoat
+from tests.safety.scapegoat import Order, Scapegoat
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 
 async def main():

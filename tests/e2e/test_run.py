@@ -27,6 +27,7 @@ from morpheyes_daemon.simulation.airframe.dynamics import Vehicle
 from morpheyes_daemon.simulation.autopilot.tcp_server import MavlinkServer
 from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
+from morpheyes_daemon.stereo.calibration_file import write_calibration
 from tests.support.fixed_rig import fixed_rig
 from tests.support.real_images import real_images
 
@@ -150,7 +151,7 @@ def test_a_calibration_of_another_rig_is_refused(tmp_path: Path, scenes: Path) -
 async def test_what_is_missing_is_waited_for_and_said_once(tmp_path: Path, scenes: Path) -> None:
     servo = "{backend: serial, url: 'serial:/dev/no-such-teensy:115200'}"
     config = write_config(tmp_path, scenes, NOBODY, servo)
-    RigTwin(WIDTH, HEIGHT, 0).exact_rig().save(tmp_path / "rig.yaml")
+    write_calibration(RigTwin(WIDTH, HEIGHT, 0).exact_rig(), tmp_path / "rig.yaml")
     async with running(config) as daemon:
         for words in ("no-such-teensy", NOBODY, "preflight"):
             await daemon.until(lambda said, words=words: any(words in line for line in said))

@@ -16,7 +16,7 @@ from morpheyes_daemon.safety.monitor import Guardian
 from morpheyes_daemon.safety.states import HOLDING
 from morpheyes_daemon.supervisor.supervisor import Pulse
 from morpheyes_daemon.tasks.avoidance import avoidance
-from tests.support.noisy_daemon import NoisyDaemon
+from tests.safety.noisy_daemon import NoisyDaemon
 
 
 class Switch:

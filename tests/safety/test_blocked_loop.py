@@ -11,7 +11,7 @@ from morpheyes_daemon.config.vehicle import NoServoConfig
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.tasks.health import LISTEN_HZ
-from tests.support.noisy_daemon import NoisyDaemon
+from tests.safety.noisy_daemon import NoisyDaemon
 
 
 @pytest.mark.parametrize(("held_up_s", "noticed"), [(0.3, True), (0.15, True), (0.04, False)])

@@ -12,7 +12,7 @@ from morpheyes_daemon.doctor.findings import Severity
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
-from tests.support.noisy_daemon import NoisyDaemon
+from tests.safety.noisy_daemon import NoisyDaemon
 
 DANGEROUS = [
     (*changes.popitem(), finding)

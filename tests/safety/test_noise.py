@@ -10,7 +10,7 @@ from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config.vehicle import NoServoConfig, SerialServoConfig, ServoConfig
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
-from tests.support.noisy_daemon import (
+from tests.safety.noisy_daemon import (
     STRANGER,
     Noise,
     NoisyDaemon,

@@ -16,7 +16,7 @@ from morpheyes_daemon.safety.gate import Gate, StickLimits
 from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import Guardian, GuardianLimits
 from morpheyes_daemon.safety.states import Transition
-from tests.support.guardian_witness import Witness
+from tests.safety.guardian_witness import Witness
 
 LIMITS = StickLimits((1000, 1010, 1020, 1000), (2000, 1990, 1980, 2000), (1500, 1490, 1500, 1510))
 OTHER_LIMITS = StickLimits((1100, 1100, 1100, 1100), (1900, 1900, 1900, 1900), (1480, 1520, 1500, 1500), 2500.0)

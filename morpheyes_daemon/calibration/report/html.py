@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from morpheyes_daemon.calibration.report import figures
 from morpheyes_daemon.calibration.report.depth_error_budget import Conditions
 from morpheyes_daemon.errors import CalibrationError
+from morpheyes_daemon.stereo.calibration_file import calibration_hash
 from morpheyes_daemon.stereo.rig import RigModel
 
 _GREEN, _AMBER, _RED = "#1f7a54", "#b26a00", "#b3261e"
@@ -89,7 +90,7 @@ def report_html(rig: RigModel, conditions: Conditions) -> str:
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style><main>"
         f"<header><h1>{html.escape(title)}</h1><p>{html.escape(_subtitle(rig))}</p></header>"
         f"{_verdict(rig)}{_cards(rig)}{''.join(sections)}"
-        f"<footer>sha256 {rig.hash}</footer></main></html>"
+        f"<footer>sha256 {calibration_hash(rig)}</footer></main></html>"
     )
 
 

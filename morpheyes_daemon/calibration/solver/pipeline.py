@@ -24,6 +24,7 @@ from morpheyes_daemon.calibration.targets.detection import CornerCache, observe
 from morpheyes_daemon.calibration.targets.image_pairs import read_folder
 from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
 from morpheyes_daemon.errors import CalibrationError
+from morpheyes_daemon.stereo.calibration_file import write_calibration
 
 CORNERS_SUFFIX = ".corners.npz"
 
@@ -40,7 +41,7 @@ def solve_folder(
     observations = observe(folders, board, cache, progress, problems)
     solved = solve_observations(observations, progress, header)
     if out is not None:
-        solved.rig.save(out)
+        write_calibration(solved.rig, out)
     return solved
 
 

@@ -15,6 +15,7 @@ from morpheyes_daemon.calibration.solver.projection import camera_from_vector
 from morpheyes_daemon.calibration.solver.solver import Calibration
 from morpheyes_daemon.calibration.solver.uncertainty import BaselineUncertainty, baseline_uncertainty, camera_uncertainty
 from morpheyes_daemon.calibration.targets.coverage import CELLS, cell_of, coverage
+from morpheyes_daemon.stereo.calibration_file import calibration_hash
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
 
 
@@ -52,7 +53,7 @@ class Solved:
             "square_measured_mm": round(self.scale.square_mm, 4),
             "length_ratio": None if self.scale.length_ratio is None else round(self.scale.length_ratio, 5),
             "corner_noise_px": round(calibration.solution.sigma_px, 4),
-            "calibration_hash": self.rig.hash,
+            "calibration_hash": calibration_hash(self.rig),
         }
 
 

@@ -18,6 +18,7 @@ from morpheyes_daemon.cli.calibrate.options import (
     SquareOption,
     ViewsOption,
 )
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 
 if TYPE_CHECKING:
     from morpheyes_daemon.config.vehicle import VehicleConfig
@@ -101,9 +102,8 @@ def check(
 ) -> None:
     """Check a calibration on any scene that holds still, without a board: rows at every baseline, and the yaw."""
     from morpheyes_daemon.cli.terminal.progress import progress_line
-    from morpheyes_daemon.stereo.rig import RigModel
 
-    rig = RigModel.load(file)
+    rig = read_calibration(file)
     with progress_line() as progress:
         if folder is not None:
             result = _check_recorded(rig, folder, baseline_mm, progress)
@@ -135,9 +135,8 @@ def repeatability(
     from morpheyes_daemon.calibration.targets.image_pairs import read_folder
     from morpheyes_daemon.cli.calibrate.options import choose_board
     from morpheyes_daemon.cli.terminal.progress import progress_line
-    from morpheyes_daemon.stereo.rig import RigModel
 
-    rig = RigModel.load(file)
+    rig = read_calibration(file)
     known = read_board_file(folder) if folder.is_dir() else {}
     chosen = choose_board(known, board, square_mm, marker_mm, ask=not as_json and sys.stdin.isatty())
     with progress_line() as progress:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from morpheyes_daemon.cli.calibrate.options import BoardOption, ConfigOption, JsonOption, MarkerOption, SquareOption
+from morpheyes_daemon.stereo.calibration_file import read_calibration, write_calibration
 
 if TYPE_CHECKING:
     from morpheyes_daemon.calibration.mount import MountSolution, MountViews
@@ -38,9 +39,8 @@ def mount(
     from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.config.packaged import load_config
     from morpheyes_daemon.perception.craft import build_craft
-    from morpheyes_daemon.stereo.rig import RigModel
 
-    rig = RigModel.load(file)
+    rig = read_calibration(file)
     known = read_board_file(folder) if folder.is_dir() else {}
     chosen = choose_board(known, board, square_mm, marker_mm, ask=not as_json and sys.stdin.isatty())
     R_frd_rig = build_craft(load_config(config)).T_frd_rig[:3, :3]
@@ -48,7 +48,7 @@ def mount(
         views = read_mount_folder(folder, chosen, rig.cam0, progress)
     found = solve_mount(views, R_frd_rig, ways_up(chosen))
     written = out or file
-    replace(rig, mount=found.mount).save(written)
+    write_calibration(replace(rig, mount=found.mount), written)
     if as_json:
         typer.echo(json.dumps({**_figures(found, views), "file": str(written)}, indent=2))
     else:

@@ -22,6 +22,7 @@ from morpheyes_daemon.cli.calibrate.options import (
     choose_baselines_m,
     choose_board,
 )
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 
 if TYPE_CHECKING:
     from morpheyes_daemon.calibration.solver.result import Solved
@@ -69,11 +70,10 @@ def report(
     """Write a page that shows how good a calibration is, what depth errors to expect, and what to retake."""
     from morpheyes_daemon.calibration.report.depth_error_budget import Conditions
     from morpheyes_daemon.calibration.report.html import write_report
-    from morpheyes_daemon.stereo.rig import RigModel
 
     page = file.with_suffix(".html") if out is None else out
     conditions = Conditions(matcher_px, servo_mm / 1e3, sync_ms / 1e3, sideways_m_s)
-    write_report(RigModel.load(file), page, conditions)
+    write_report(read_calibration(file), page, conditions)
     typer.echo(f"{page}")
 
 
@@ -135,9 +135,8 @@ def evaluate(
     """Compare a solved file with the truth of the simulator's rig, at 41 baselines."""
     from morpheyes_daemon.benchmarks.calibration_error import compare_separate, evaluate_rig, twin_of
     from morpheyes_daemon.cli.terminal.progress import progress_line
-    from morpheyes_daemon.stereo.rig import RigModel
 
-    rig = RigModel.load(file)
+    rig = read_calibration(file)
     twin = twin_of(rig, seed, file)
     truth = evaluate_rig(rig, twin)
     figures: dict[str, Any] = truth.figures()

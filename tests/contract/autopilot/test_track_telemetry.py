@@ -13,7 +13,7 @@ from morpheyes_daemon.clock import S, run_virtual
 from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig
 from morpheyes_daemon.messages.core import Perception, Track
 from morpheyes_daemon.strategies.imo.strategy import ImoPercept
-from tests.support.noisy_daemon import NoisyDaemon
+from tests.safety.noisy_daemon import NoisyDaemon
 from tests.support.seen_from_above import SUMMARY, empty_profile
 
 ACTED_ON = {"LANDING_TARGET", "FOLLOW_TARGET", "OBSTACLE_DISTANCE_3D"}

@@ -12,7 +12,7 @@ import yaml
 from morpheyes_daemon.cli import main
 from morpheyes_daemon.flights.sim_boards import render_folder
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
-from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.stereo.calibration_file import read_calibration, write_calibration
 
 NOMINAL_M = (0.1, 0.2, 0.3)
 
@@ -158,7 +158,7 @@ def test_the_same_seed_renders_the_same_pictures(boards: Path, tmp_path: Path) -
 
 def test_the_eyes_mount_is_measured_and_written_into_the_file(tmp_path: Path, terminal: Terminal) -> None:
     file, held = tmp_path / "rig.yaml", tmp_path / "held"
-    RigTwin(640, 480, seed=0).exact_rig(3).save(file)
+    write_calibration(RigTwin(640, 480, seed=0).exact_rig(3), file)
     assert terminal("render", held, "--mount", "--views", 20)[0] == 0
     code, out, _ = terminal("mount", file, held, "--out", tmp_path / "mounted.yaml", "--json")
     found = json.loads(out)
@@ -166,8 +166,8 @@ def test_the_eyes_mount_is_measured_and_written_into_the_file(tmp_path: Path, te
     # the twin's left eye is turned by -0.52, 0.32 and 0.08 degrees
     assert found["rotation_deg"] == pytest.approx([-0.52, 0.32, 0.08], abs=0.25)
     assert max(found["sigma_deg"]) < 0.15
-    assert RigModel.load(tmp_path / "mounted.yaml").mount is not None
-    assert RigModel.load(file).mount is None
+    assert read_calibration(tmp_path / "mounted.yaml").mount is not None
+    assert read_calibration(file).mount is None
     before, after = (
         json.loads(terminal("evaluate", one, "--seed", 0, "--json")[1])["pointing_error_deg"][0]
         for one in (file, tmp_path / "mounted.yaml")
@@ -176,12 +176,12 @@ def test_the_eyes_mount_is_measured_and_written_into_the_file(tmp_path: Path, te
     assert after < 0.25
     code, out, _ = terminal("mount", file, held)
     assert "the left eye is turned up by -0." in out
-    assert RigModel.load(file).mount is not None
+    assert read_calibration(file).mount is not None
 
 
 def test_without_attitudes_it_says_what_to_do(boards: Path, tmp_path: Path, terminal: Terminal) -> None:
     file = tmp_path / "rig.yaml"
-    RigTwin(640, 480, seed=0).exact_rig(3).save(file)
+    write_calibration(RigTwin(640, 480, seed=0).exact_rig(3), file)
     code, _, err = terminal("mount", file, boards)
     assert code != 0
     assert "calibrate capture --mount" in err

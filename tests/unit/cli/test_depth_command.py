@@ -10,6 +10,7 @@ import pytest
 
 from morpheyes_daemon.cli import main
 from morpheyes_daemon.messages.core import Pinhole
+from morpheyes_daemon.stereo.calibration_file import write_calibration
 from tests.support.panels import Panel, crooked_rig, ideal_pair, raw_pair
 
 PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)
@@ -47,7 +48,7 @@ def pictures(tmp_path_factory) -> Path:
     raw = raw_pair([Panel(3.0)], crooked_rig(320, 240), 0.25, 1.5)
     for name, image in zip(("raw_left.png", "raw_right.png"), raw, strict=True):
         cv2.imwrite(str(folder / name), image)
-    crooked_rig().save(folder / "rig.yaml")
+    write_calibration(crooked_rig(), folder / "rig.yaml")
     (folder / "torn.png").write_bytes(PNG + b"torn")
     return folder
 

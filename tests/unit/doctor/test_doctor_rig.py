@@ -27,6 +27,7 @@ from morpheyes_daemon.doctor.machine import examine_machine
 from morpheyes_daemon.doctor.rig import examine_calibration, examine_camera, examine_servo
 from morpheyes_daemon.errors import DeviceNotFoundError, DeviceTimeoutError
 from morpheyes_daemon.messages.core import Image, RawPair
+from morpheyes_daemon.stereo.calibration_file import write_calibration
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import EyeMount, RigModel
 
@@ -145,7 +146,7 @@ async def test_images_of_another_size_are_a_finding(tmp_path: Path) -> None:
 
 def saved(tmp_path: Path, model: RigModel) -> Path:
     path = tmp_path / "calibration.yaml"
-    model.save(path)
+    write_calibration(model, path)
     return path
 
 

@@ -62,7 +62,7 @@ class Hands:
 def take(hands: Hands, out: Path, wanted: int) -> tuple[int, set[str]]:
     said: set[str] = set()
     stand, clock = cast(Any, hands), cast(Any, hands)
-    say = lambda kept, text: said.add(text)
+    say = lambda kept, text: said.add(text)  # noqa: E731
     return asyncio.run(capture_mount(stand, hands.vehicle, clock, out, BOARD, wanted, say)), said
 
 

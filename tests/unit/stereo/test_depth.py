@@ -8,6 +8,7 @@ import pytest
 from morpheyes_daemon.config.vehicle import StereoConfig
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame
+from morpheyes_daemon.stereo.calibration_file import calibration_hash
 from morpheyes_daemon.stereo.depth import (
     DepthEstimator,
     depth_from_disparity,
@@ -60,7 +61,7 @@ def test_a_depth_map_says_what_it_was_made_from(rig):
     depth = DepthEstimator(rig, size=SIZE).estimate(frame_of(left, right, 0.2))
     assert (depth.seq, depth.t_ns) == (7, 123)
     assert depth.baseline_m == pytest.approx(rig.length_m(0.2))
-    assert depth.calibration_hash == rig.hash
+    assert depth.calibration_hash == calibration_hash(rig)
     assert depth.near_limit_m == pytest.approx(depth.baseline_m * depth.pinhole.f_px / 80)
     assert depth.valid_fraction == pytest.approx(np.isfinite(depth.depth_m).mean())
     assert depth.ceiling_fraction == pytest.approx(depth.near.mean())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.simulation.camera.true_rig import RANGE_M, RigErrors, RigTwin
-from morpheyes_daemon.stereo.rig import RigModel
+from morpheyes_daemon.stereo.calibration_file import read_calibration, write_calibration
 from morpheyes_daemon.transforms import inverse, q_from_R
 
 
@@ -57,8 +57,8 @@ def test_a_perfect_rig_is_perfect() -> None:
 def test_the_exact_file_is_exact(tmp_path: Path) -> None:
     rig = RigTwin(seed=3)
     path = tmp_path / "rig.yaml"
-    rig.exact_rig().save(path)
-    model = RigModel.load(path)
+    write_calibration(rig.exact_rig(), path)
+    model = read_calibration(path)
     assert model.method == "exact"
     # the file keeps nine digits
     assert np.allclose(astuple(model.cam0)[:7], astuple(rig.cam0)[:7], atol=1e-8)
