@@ -8,7 +8,6 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
-from tests.unit.test_doctor_parameters import BAD
 
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config.vehicle import AutopilotConfig, NoServoConfig, SimCameraConfig, VehicleConfig
@@ -19,6 +18,7 @@ from morpheyes_daemon.doctor.vehicle import VehicleExamination
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.simulation.autopilot.parameters import RECOMMENDED
 from tests.support.hub_bench import HubBench
+from tests.unit.doctor.test_doctor_parameters import BAD
 
 
 def config(**autopilot: object) -> VehicleConfig:

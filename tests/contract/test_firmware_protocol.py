@@ -25,7 +25,7 @@ from morpheyes_daemon.wire.servo import (
     decode_body,
     encode,
 )
-from tests.unit.test_servo_wire import GOLDEN
+from tests.unit.wire.test_servo_wire import GOLDEN
 
 ROOT = Path(__file__).parents[2]
 SKETCH = ROOT / "firmware" / "morpheyes_servo"

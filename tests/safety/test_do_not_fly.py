@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from tests.unit.test_doctor_parameters import BAD
 
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config.vehicle import NoServoConfig, SerialServoConfig
@@ -13,6 +12,7 @@ from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
 from tests.safety.noisy_daemon import NoisyDaemon
+from tests.unit.doctor.test_doctor_parameters import BAD
 
 DANGEROUS = [
     (*changes.popitem(), finding)

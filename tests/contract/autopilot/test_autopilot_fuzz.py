@@ -9,9 +9,9 @@ import struct
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from tests.contract.test_autopilot_hub import with_hub
 
 from morpheyes_daemon.messages.core import VehicleState
+from tests.contract.autopilot.test_autopilot_hub import with_hub
 from tests.support.hub_bench import HubBench
 
 HEARD = (0, 1, 22, 30, 32, 65, 77, 111, 132, 193, 245, 253)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from tests.unit.test_spool import disk_full_at
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import MonotonicClock, S
@@ -19,6 +18,7 @@ from morpheyes_daemon.recorder.reader import Flight, read_flight
 from morpheyes_daemon.recorder.recorder import QUEUE_LIMIT, Recorder
 from tests.support.hand_clock import HandClock
 from tests.support.synthetic_flight import SyntheticFlight
+from tests.unit.recorder.test_spool import disk_full_at
 
 CONFIG = VehicleConfig(camera=SimCameraConfig(), servo=NoServoConfig(backend="none"))
 
