@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Set up an environment of its own in .venv, then fly or test. Needs nothing but Python 3.11 and pip.
 
-    python3 start.py fly  [options of `morpheyes sim forest`]
-    python3 start.py test [options of pytest]
+python3 start.py fly  [options of `morpheyes sim forest`]
+python3 start.py test [options of pytest]
 """
 
 import hashlib

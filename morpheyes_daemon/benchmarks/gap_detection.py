@@ -17,7 +17,7 @@ from morpheyes_daemon.campaigns.gap_ground_truth import filled, iou, true_masks
 from morpheyes_daemon.clock import S, VirtualClock, VirtualLoop, processor_s, stopwatch_s
 from morpheyes_daemon.flights.flight_plan import with_seed
 from morpheyes_daemon.flights.lockstep import FlightPlan
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 from morpheyes_daemon.messages.core import BaselineEstimate, Image, RawPair, StereoFrame, VehicleState
 from morpheyes_daemon.perception.craft import build_strategy
 from morpheyes_daemon.simulation.worlds.world import GapTruth
@@ -131,7 +131,7 @@ def bench_gap(plan: FlightPlan, repeats: int, report: Report) -> GapBench:
 def gap_view(plan: FlightPlan, k: int, stack: int = STACK) -> GapView:
     """Render the k-th view: another wall every time, the ranges in turn, a little off the opening's axis."""
     loop = VirtualLoop()
-    stage = Stage(with_seed(plan, k).scenario, plan.config, VirtualClock(loop))
+    stage = SimVehicle(with_seed(plan, k).scenario, plan.config, VirtualClock(loop))
     rng = np.random.default_rng(k)
     range_m = RANGES_M[k % len(RANGES_M)]
     gap = stage.world.gaps[0]

@@ -19,8 +19,8 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount, ServoMotion
 from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame, VehicleState
-from morpheyes_daemon.perception.camera_motion import EyeMotion, eye_motion
-from morpheyes_daemon.perception.extrinsics_monitor import DriftLimits, DriftMonitor, DriftReport
+from morpheyes_daemon.perception.camera_motion import CameraMotion, camera_motion
+from morpheyes_daemon.perception.extrinsics_monitor import ExtrinsicsLimits, ExtrinsicsMonitor, ExtrinsicsReport
 from morpheyes_daemon.perception.yaw_estimator import STILL, Uncertain
 from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
@@ -83,12 +83,12 @@ class _Watched:
         self.start_ned_m = np.array([north, east, -_HEIGHT_M])
         self._twin = twin
         self._camera = CameraTwin(Renderer(world.scene), twin, Mount(), Sensor(sync_offset_s=late_s), seed)
-        self.monitor = DriftMonitor(rig, DriftLimits(), uncertain)
+        self.monitor = ExtrinsicsMonitor(rig, ExtrinsicsLimits(), uncertain)
         self._estimator = DepthEstimator(rig)
 
     def look(
         self, seq: int, t_ns: int, nominal_m: float, pose_at: Callable[[int], Array], state: VehicleState | None
-    ) -> DriftReport:
+    ) -> ExtrinsicsReport:
         """Take one pair and have it watched; a `state` of None is a vehicle that stands."""
         pair = self._camera.render_pair(t_ns, seq, pose_at, self._twin.actual_m(nominal_m))
         sigma_m = ServoMotion().repeatability_sigma_mm / 1e3
@@ -99,9 +99,9 @@ class _Watched:
         offsets = row_offsets(rectified.left, rectified.right, disparity_of(depth))
         mounted = T_frd_rig(Mount())
         if state is None:
-            motion = EyeMotion.still(pose_at(t_ns) @ mounted @ depth.T_rig_rect)
+            motion = CameraMotion.still(pose_at(t_ns) @ mounted @ depth.T_rig_rect)
         else:
-            motion = eye_motion(state, mounted, depth.T_rig_rect)
+            motion = camera_motion(state, mounted, depth.T_rig_rect)
         report = self.monitor.update(rectified, depth, offsets, False, motion)
         if report.rig_changed:
             self._estimator = self._estimator.turned(self.monitor.rig)

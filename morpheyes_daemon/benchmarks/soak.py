@@ -98,7 +98,7 @@ async def _sticks(plan: FlightPlan, minutes: float, show: Show, folder: Path) ->
             beat=flight.beat.intervals(),
             frames=flight.tally.frames,
             worst_lateness_ms=health.worst_lateness_ms if health is not None else 0.0,
-            final_state=str(flight.daemon.guardian.state),
+            final_state=str(flight.daemon.monitor.state),
         )
 
 
@@ -161,9 +161,9 @@ def resident_mb(pid: int) -> float:
 async def _engaged(flight: RealtimeFlight) -> None:
     clock = running_clock()
     end_ns = clock.now_ns() + round(ENGAGE_LIMIT_S * S)
-    while flight.daemon.guardian.state is not State.ENGAGED:
+    while flight.daemon.monitor.state is not State.ENGAGED:
         if clock.now_ns() > end_ns:
-            raise DeviceTimeoutError(f"the daemon did not engage: {flight.daemon.guardian.reason.text}.")
+            raise DeviceTimeoutError(f"the daemon did not engage: {flight.daemon.monitor.reason.text}.")
         await _live(flight, 0.1)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from morpheyes_daemon.clock import S, VirtualClock, VirtualLoop, stopwatch_s
 from morpheyes_daemon.flights.lockstep import FlightPlan
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 from morpheyes_daemon.messages.core import BaselineEstimate, Perception, RawPair, StereoFrame, VehicleState
 from morpheyes_daemon.perception.pipeline import PipelineFactory, VisionJob
 from morpheyes_daemon.stereo.calibration_file import read_calibration
@@ -75,7 +75,7 @@ class Rig:
     def __init__(self, plan: FlightPlan) -> None:
         loop = VirtualLoop()
         self._loop = loop
-        self._stage = Stage(plan.scenario, plan.config, VirtualClock(loop), plan.threads)
+        self._stage = SimVehicle(plan.scenario, plan.config, VirtualClock(loop), plan.threads)
 
     def pair(self, k: int) -> RawPair:
         """Render the k-th pair of the course."""

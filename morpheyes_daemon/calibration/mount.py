@@ -22,7 +22,7 @@ from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
-from morpheyes_daemon.stereo.rig import EyeMount
+from morpheyes_daemon.stereo.rig import CameraMount
 from morpheyes_daemon.transforms import Array, R_from_rotvec, R_from_rpy, rotvec_from_R
 
 ATTITUDES = "attitudes.csv"
@@ -53,7 +53,7 @@ class MountViews:
 class MountSolution:
     """The left eye's rotation on the bar; `rms_rad` is what is left between attitude and board in a view."""
 
-    mount: EyeMount
+    mount: CameraMount
     rms_rad: float
     turned_rad: float
     """How far the vehicle was turned, root mean square about the middle of its attitudes."""
@@ -89,7 +89,7 @@ def solve_mount(views: MountViews, R_frd_rig: Array, turns: int) -> MountSolutio
             f"farther (these pictures: {math.degrees(turned):.0f} degrees) about all three axes, and hold it still."
         )
     x = rotvec_from_R(X)
-    mount = EyeMount((float(x[0]), float(x[1]), float(x[2])), (float(sigma[0]), float(sigma[1]), float(sigma[2])))
+    mount = CameraMount((float(x[0]), float(x[1]), float(x[2])), (float(sigma[0]), float(sigma[1]), float(sigma[2])))
     return MountSolution(mount, rms, turned)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from morpheyes_daemon.campaigns.gap_ground_truth import filled, iou, true_masks
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.lockstep import FlightPlan
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 from morpheyes_daemon.messages.core import Perception, StereoFrame
 from morpheyes_daemon.messages.safety import GateOutput, State
 from morpheyes_daemon.simulation.worlds.gap_world import GapWorld, drawn_shape
@@ -46,7 +46,7 @@ class GapMeasures:
         self._before_m = math.nan
         self._sequence: list[list[float]] = []
 
-    def attach(self, daemon: Daemon, stage: Stage) -> None:
+    def attach(self, daemon: Daemon, stage: SimVehicle) -> None:
         """Look on at this flight."""
         daemon.topics.frame.tap(self._keep)
         daemon.topics.perception.tap(lambda seen: self._compare(seen, daemon, stage))
@@ -69,10 +69,10 @@ class GapMeasures:
         while len(self._frames) > FRAMES_KEPT:
             del self._frames[next(iter(self._frames))]
 
-    def _compare(self, seen: Perception, daemon: Daemon, stage: Stage) -> None:
+    def _compare(self, seen: Perception, daemon: Daemon, stage: SimVehicle) -> None:
         """Hold every opening seen whole against the true one that it covers best, until the wall is behind."""
         frame = self._frames.get(seen.summary.seq)
-        if daemon.guardian.state is not State.ENGAGED or frame is None or not isinstance(seen.percept, GapPercept):
+        if daemon.monitor.state is not State.ENGAGED or frame is None or not isinstance(seen.percept, GapPercept):
             return
         openings = [opening for opening in seen.percept.openings if not opening.cut]
         gap, t_ns = stage.world.gaps[0], frame.t_ns
@@ -87,7 +87,7 @@ class GapMeasures:
             contour = filled(opening.contour_px, rectified.pinhole)
             self._ious.append(max(iou(contour, mask) for mask in masks))
 
-    def _watch(self, out: GateOutput, stage: Stage) -> None:
+    def _watch(self, out: GateOutput, stage: SimVehicle) -> None:
         gap = stage.world.gaps[0]
         truth = stage.truth(out.t_ns)
         T_wall_frd = inverse(gap.T_ned_wall(stage.world_s(out.t_ns))) @ truth.T_ned_frd
@@ -123,5 +123,3 @@ def _world_of(plan: FlightPlan) -> tuple[str, str]:
 
 def _rounded(value: float) -> float | None:
     return round(value, 4) if math.isfinite(value) else None
-
-

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.lockstep import FlightPlan
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 from morpheyes_daemon.messages.core import Perception, Pinhole, StereoFrame, Track
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.simulation.worlds.loader import load_world
@@ -70,7 +70,7 @@ class ImoMeasures:
         self._watched = 0
         self._false = 0
 
-    def attach(self, daemon: Daemon, stage: Stage) -> None:
+    def attach(self, daemon: Daemon, stage: SimVehicle) -> None:
         """Look on at this flight."""
         daemon.topics.frame.tap(self._keep)
         daemon.topics.perception.tap(lambda seen: self._compare(seen, daemon, stage))
@@ -100,9 +100,9 @@ class ImoMeasures:
         while len(self._frames) > FRAMES_KEPT:
             del self._frames[next(iter(self._frames))]
 
-    def _compare(self, seen: Perception, daemon: Daemon, stage: Stage) -> None:
+    def _compare(self, seen: Perception, daemon: Daemon, stage: SimVehicle) -> None:
         frame = self._frames.get(seen.summary.seq)
-        if daemon.guardian.state is not State.ENGAGED or frame is None or not isinstance(seen.percept, ImoPercept):
+        if daemon.monitor.state is not State.ENGAGED or frame is None or not isinstance(seen.percept, ImoPercept):
             return
         self._watched += 1
         face, track = self._face(frame, stage), seen.percept.track
@@ -113,12 +113,12 @@ class ImoMeasures:
             t_s = stage.world_s(frame.t_ns)
             self._samples.append(Sample(t_s, float(face.p_rect[2]), measured, stage.baseline_m(frame.t_ns)))
 
-    def _moves(self, frame: StereoFrame, stage: Stage) -> bool:
+    def _moves(self, frame: StereoFrame, stage: SimVehicle) -> bool:
         t_s = stage.world_s(frame.t_ns)
         T = stage.world.scene.moving[0].T_ned_object
         return bool(np.linalg.norm(T(t_s)[:3, 3] - T(t_s - 0.1)[:3, 3]) > 0.1 * MOVES_M_S)
 
-    def _face(self, frame: StereoFrame, stage: Stage) -> Face | None:
+    def _face(self, frame: StereoFrame, stage: SimVehicle) -> Face | None:
         """Return what the left eye really sees of the object at the frame's exposure."""
         if not stage.world.scene.moving or not self._edge_m:
             return None
@@ -213,5 +213,3 @@ def _columns(room: RoomWorld) -> list[tuple[Array, Array]]:
         (pose(np.eye(3), np.array([x, y, -room.height_m / 2])), np.array([edge, edge, room.height_m]))
         for x, y, edge in room.pillars
     ]
-
-

@@ -103,9 +103,7 @@ def _cell(mode: str, rows: Sequence[Row]) -> Row:
 
 def _span(samples: Sequence[Sample], from_m: float, to_m: float) -> Row:
     errors = [
-        abs(s.measured_m / s.true_m - 1.0)
-        for s in samples
-        if s.measured_m is not None and from_m <= s.true_m < to_m
+        abs(s.measured_m / s.true_m - 1.0) for s in samples if s.measured_m is not None and from_m <= s.true_m < to_m
     ]
     return {
         "from_m": from_m,

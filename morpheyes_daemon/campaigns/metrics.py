@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.lockstep import FlightPlan
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 
 MEASURES = {
     "gap": "morpheyes_daemon.campaigns.gap_metrics:GapMeasures",
@@ -20,7 +20,7 @@ MEASURES = {
 class Measures(Protocol):
     """Looks on at one flight."""
 
-    def attach(self, daemon: Daemon, stage: Stage) -> None:
+    def attach(self, daemon: Daemon, stage: SimVehicle) -> None:
         """Tap what is needed."""
 
     def row(self) -> dict[str, Any]:

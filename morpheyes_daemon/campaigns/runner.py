@@ -21,7 +21,7 @@ from morpheyes_daemon.campaigns.forest_table import Row
 from morpheyes_daemon.campaigns.metrics import measures_for
 from morpheyes_daemon.campaigns.results import Results, draw_figures, results_of
 from morpheyes_daemon.errors import InputError, MorphEyesError, UsageError, mistake
-from morpheyes_daemon.flights.artifacts import FlightOutputs
+from morpheyes_daemon.flights.artifacts import FlightArtifacts
 from morpheyes_daemon.flights.flight_plan import hold, parse_baseline, with_seed
 from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
 from morpheyes_daemon.simulation.worlds.loader import load_world
@@ -152,7 +152,7 @@ def fly_one(plan: FlightPlan, key: str, folder: Path | None = None) -> Row:
     """Fly one plan and return its row, leaving log and pictures in `folder`; runs in a worker process."""
     measures = measures_for(plan)
     watchers = Watchers(attach=[measures.attach] if measures else [])
-    outputs = FlightOutputs(folder, plan) if folder else None
+    outputs = FlightArtifacts(folder, plan) if folder else None
     if outputs:
         outputs.watch(watchers)
     summary = fly(plan, watchers)

@@ -30,9 +30,7 @@ def command(
         (out / "analysis.json").write_text(text + "\n", encoding="utf-8")
         pictures = draw_all(out, subject, numbers)
     except OSError as error:
-        raise InputError(
-            f"{out}: the results cannot be written there ({error.strerror}); name another --out."
-        ) from None
+        raise InputError(f"{out}: the results cannot be written there ({error.strerror}); name another --out.") from None
     if as_json:
         typer.echo(text)
         return

@@ -102,9 +102,7 @@ def _rows(model: type, prefix: str) -> list[dict[str, str]]:
             continue
         bounds = ", ".join(str(bound) for bound in field.metadata if any(c in str(bound) for c in "gl"))
         default = "required" if field.is_required() else repr(field.get_default(call_default_factory=True))
-        rows.append(
-            {"key": prefix + name, "default": default, "bounds": bounds, "meaning": field.description or ""}
-        )
+        rows.append({"key": prefix + name, "default": default, "bounds": bounds, "meaning": field.description or ""})
     return rows
 
 

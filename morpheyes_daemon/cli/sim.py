@@ -40,9 +40,7 @@ def command(
     world: Annotated[str | None, typer.Option(help="World by name or path, instead of the mission's own.")] = None,
     wind_m_s: Annotated[float, typer.Option(min=0.0, max=15.0, help="Mean wind, with its gusts.")] = 2.0,
     latency_ms: Annotated[float | None, typer.Option(min=0.0, help="Frame to depth in lockstep.")] = None,
-    limit_s: Annotated[
-        float, typer.Option(min=1.0, help="Simulated seconds until the flight counts as lost.")
-    ] = 180.0,
+    limit_s: Annotated[float, typer.Option(min=1.0, help="Simulated seconds until the flight counts as lost.")] = 180.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON and nothing else.")] = False,
 ) -> None:
     """Fly a mission in the simulator with the real daemon, and leave log, map, strips and film in a folder.
@@ -86,10 +84,10 @@ def command(
 
 def _fly_lockstep(plan: FlightPlan, folder: Path, quiet: bool) -> Summary:
     from morpheyes_daemon.cli.terminal.flight_line import FlightLine
-    from morpheyes_daemon.flights.artifacts import FlightOutputs
+    from morpheyes_daemon.flights.artifacts import FlightArtifacts
     from morpheyes_daemon.flights.lockstep import Watchers, fly
 
-    outputs = FlightOutputs(folder, plan)
+    outputs = FlightArtifacts(folder, plan)
     watchers = Watchers()
     outputs.watch(watchers)
     with FlightLine(quiet) as line:

@@ -32,9 +32,7 @@ def command(
     from morpheyes_daemon.flights.flight_plan import parse_size
     from morpheyes_daemon.paper.path_traced_stills import StillPlan, make_stills
 
-    plan = StillPlan(
-        world, seed, first_m, steps, step_m, height_m, yaw_deg, baseline, parse_size(size), samples
-    )
+    plan = StillPlan(world, seed, first_m, steps, step_m, height_m, yaw_deg, baseline, parse_size(size), samples)
     with progress_line() as report:
         results = [result.as_json() for result in make_stills(plan, out, report)]
     (out / "stills.json").write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")

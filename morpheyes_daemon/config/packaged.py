@@ -20,12 +20,6 @@ def shipped(name: str) -> Path:
     return inside if inside.exists() else _PACKAGE.parent / name
 
 
-
-
-
-
-
-
 def load_config(path: Path | None) -> VehicleConfig:
     """Read and check a vehicle configuration; None takes ./config.yaml or the shipped example."""
     if path is None:

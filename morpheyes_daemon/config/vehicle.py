@@ -72,9 +72,7 @@ class V4l2CameraConfig(CameraBase):
     swap_eyes: bool = Field(False, description="the right eye is in the left half")
 
 
-CameraConfig = Annotated[
-    SimCameraConfig | RecordingCameraConfig | V4l2CameraConfig, Field(discriminator="backend")
-]
+CameraConfig = Annotated[SimCameraConfig | RecordingCameraConfig | V4l2CameraConfig, Field(discriminator="backend")]
 
 
 class ServoMotion(Section):

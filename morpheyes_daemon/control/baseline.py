@@ -219,5 +219,3 @@ def baseline_model(servo: ServoConfig) -> BaselineModel | FixedBaseline:
     if isinstance(servo, NoServoConfig):
         return FixedBaseline(servo.baseline_mm / 1e3)
     return BaselineModel(servo.motion)
-
-

@@ -82,9 +82,7 @@ class Governor:
         )
         seen = {"clear": command.clear_m - flown_m, "trust": trust_m - flown_m}
         bounds = {
-            name: stopping.speed_for_distance_m(
-                max(0.0, distance - limits.standoff_m), height_m, limits.dead_daemon_s
-            )
+            name: stopping.speed_for_distance_m(max(0.0, distance - limits.standoff_m), height_m, limits.dead_daemon_s)
             for name, distance in seen.items()
         }
         bounds["sync"] = self._sync_bound(summary, command)

@@ -151,9 +151,7 @@ class LoiterModel:
         """Build the model from the autopilot's parameters by name; raises DeviceError naming what is missing."""
         axes = _mapped_axes(parameters)
         up = p.PILOT_SPEED_UP.read(parameters)
-        throttle = ThrottleAxis(
-            axes[2], p.THR_DZ.read(parameters), up, abs(p.PILOT_SPEED_DN.read(parameters)) or up
-        )
+        throttle = ThrottleAxis(axes[2], p.THR_DZ.read(parameters), up, abs(p.PILOT_SPEED_DN.read(parameters)) or up)
         lean_max = p.LOIT_ANG_MAX.read(parameters) or p.ANGLE_MAX.read(parameters) * 2.0 / 3.0
         brake = Brake(
             p.LOIT_BRK_ACCEL.read(parameters),

@@ -31,7 +31,7 @@ AHEAD_MOST_S = 2.0
 """A moving line is not carried on for longer than this."""
 
 
-class LineKeeper:
+class PathFollower:
     """Holds what is missing to the line over time; one per flight."""
 
     def __init__(self) -> None:

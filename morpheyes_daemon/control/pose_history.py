@@ -11,10 +11,10 @@ from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.transforms import wrap_rad
 
 KEEP = 400
-"""States kept: about four seconds at the rates the hub asks for."""
+"""States kept: about four seconds at the rates the connection asks for."""
 
 
-class VehicleTrack:
+class PoseHistory:
     """States in order of arrival; `at` interpolates attitude and position between their own stamps."""
 
     def __init__(self) -> None:
@@ -68,9 +68,7 @@ def _around(
     return before, after, (t_ns - stamp(before)) / (stamp(after) - stamp(before))
 
 
-def _mixed(
-    a: tuple[float, float, float], b: tuple[float, float, float], weight: float
-) -> tuple[float, float, float]:
+def _mixed(a: tuple[float, float, float], b: tuple[float, float, float], weight: float) -> tuple[float, float, float]:
     return (
         a[0] + weight * (b[0] - a[0]),
         a[1] + weight * (b[1] - a[1]),

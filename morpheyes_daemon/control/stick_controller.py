@@ -10,19 +10,19 @@ from dataclasses import replace
 
 from morpheyes_daemon.control.governor import Governor
 from morpheyes_daemon.control.loiter import LoiterModel
-from morpheyes_daemon.control.path_following import LineKeeper
+from morpheyes_daemon.control.path_following import PathFollower
 from morpheyes_daemon.control.velocity import VelocityController, VelocityTuning, height_above_ground_m
 from morpheyes_daemon.messages.core import DepthSummary, Governed, MissionCommand, Sticks, VehicleState
 
 
-class FlightControl:
+class StickController:
     """Holds the velocity loop; made anew when the autopilot's parameters change."""
 
     def __init__(self, model: LoiterModel, governor: Governor, tuning: VelocityTuning) -> None:
         self.model = model
         self._governor = governor
         self._velocity = VelocityController(model, tuning)
-        self._line = LineKeeper()
+        self._line = PathFollower()
 
     def reset(self) -> None:
         """Forget what the loop has learned; call while the sticks are not ours."""
@@ -68,7 +68,5 @@ class FlightControl:
         excess = push - governed.stick_limit_m_s
         if excess <= 0.0:
             return sticks
-        roll_us, pitch_us = self.model.sticks_for_speed(
-            forward - excess * along[0], right - excess * along[1], height_m
-        )
+        roll_us, pitch_us = self.model.sticks_for_speed(forward - excess * along[0], right - excess * along[1], height_m)
         return replace(sticks, roll_us=roll_us, pitch_us=pitch_us)

@@ -19,9 +19,9 @@ from morpheyes_daemon.control.baseline_planner import BaselinePlanner
 from morpheyes_daemon.control.governor import Governor
 from morpheyes_daemon.control.limits import governor_limits, velocity_tuning
 from morpheyes_daemon.control.loiter import LoiterModel
-from morpheyes_daemon.control.pose_history import VehicleTrack
-from morpheyes_daemon.control.stick_controller import FlightControl
-from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
+from morpheyes_daemon.control.pose_history import PoseHistory
+from morpheyes_daemon.control.stick_controller import StickController
+from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
 from morpheyes_daemon.devices.camera import Camera
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.devices.servo import Servo
@@ -34,7 +34,7 @@ from morpheyes_daemon.messages.safety import Action, GateOutput, Health, State
 from morpheyes_daemon.perception.craft import build_strategy
 from morpheyes_daemon.perception.pipeline import VisionJob
 from morpheyes_daemon.safety.gate import Gate, StickLimits
-from morpheyes_daemon.safety.monitor import Guardian, GuardianLimits
+from morpheyes_daemon.safety.monitor import SafetyMonitor, SafetyMonitorLimits
 from morpheyes_daemon.safety.states import Transition
 from morpheyes_daemon.supervisor.supervisor import Supervisor, Task
 from morpheyes_daemon.tasks.avoidance import avoidance
@@ -87,29 +87,29 @@ class Daemon:
         self.config = config
         self.topics = topics
         self.events = events
-        self.track = VehicleTrack()
+        self.track = PoseHistory()
         self._parts = parts
         self._clock = parts.clock
         self._strategy = build_strategy(mission_file, config)
         self._avoids = mission_file.avoidance
-        self.hub = AutopilotHub(config.autopilot, parts.clock, topics, events, parts.opener)
-        self._send = self.hub.claim_stick_output()
+        self.connection = AutopilotConnection(config.autopilot, parts.clock, topics, events, parts.opener)
+        self._send = self.connection.claim_stick_output()
         self.gate = Gate(self._output)
-        self.guardian = Guardian(self.gate, GuardianLimits.of(config), self._on_transition)
-        self.control: FlightControl | None = None
+        self.monitor = SafetyMonitor(self.gate, SafetyMonitorLimits.of(config), self._on_transition)
+        self.control: StickController | None = None
         self._governor = Governor(governor_limits(config))
         self._model = BaselineModel(config.servo.motion) if not isinstance(config.servo, NoServoConfig) else None
         fixed_m = config.baseline_range_m[0]
         self._where = self._model or FixedBaseline(fixed_m)
-        self.hub.on_vehicle(self._on_vehicle)
+        self.connection.on_vehicle(self._on_vehicle)
         topics.track.tap(self._tell_track)
         events.subscribe(self._on_event)
         topics.command.tap(self._on_command)
-        self.hub.parameters.on_change(self._on_parameters)
+        self.connection.parameters.on_change(self._on_parameters)
         self._stops: tuple[str, ...] = ()
         self._said = ""
         self.supervisor = Supervisor(
-            self._tasks(), self.guardian, events, parts.clock, config.safety.supervisor_timeout_s
+            self._tasks(), self.monitor, events, parts.clock, config.safety.supervisor_timeout_s
         )
 
     @property
@@ -120,16 +120,16 @@ class Daemon:
     async def run(self, stop: asyncio.Event) -> None:
         """Live until `stop` is set, then neutral, release and end. Every way out sends a release."""
         await self._parts.worker.start()
-        self.guardian.set_missing(None)
+        self.monitor.set_missing(None)
         running = asyncio.create_task(self.supervisor.run(), name="supervisor")
         stopping = asyncio.create_task(stop.wait(), name="stop")
         try:
-            self.guardian.boot_done(self._clock.now_ns())
+            self.monitor.boot_done(self._clock.now_ns())
             await asyncio.wait({running, stopping}, return_when=asyncio.FIRST_COMPLETED)
             if not running.done():
                 await self._leave(running)
         finally:
-            self.guardian.release_now(Reason.SHUTDOWN, self._clock.now_ns())
+            self.monitor.release_now(Reason.SHUTDOWN, self._clock.now_ns())
             for task in (running, stopping):
                 task.cancel()
             results = await asyncio.gather(running, stopping, return_exceptions=True)
@@ -140,9 +140,9 @@ class Daemon:
 
     async def _leave(self, running: asyncio.Task[None]) -> None:
         """Neutral for a while if we hold the sticks, then the release, repeated by the gate."""
-        self.guardian.shutdown(self._clock.now_ns())
+        self.monitor.shutdown(self._clock.now_ns())
         held = self.topics.gate.get()
-        while not (self.guardian.let_go or running.done()):
+        while not (self.monitor.let_go or running.done()):
             await self._clock.sleep_until_ns(self._clock.now_ns() + S // 50)
         if held is not None and held.action is not Action.SILENT:
             await self._clock.sleep_until_ns(self._clock.now_ns() + S // 5)
@@ -150,18 +150,18 @@ class Daemon:
     def _tasks(self) -> list[Task]:
         """The task table: name, loop, the reason its death is given, and whether flight needs it."""
         config, parts, clock, topics = self.config, self._parts, self._clock, self.topics
-        gate, guardian, safety = self.gate, self.guardian, config.safety
+        gate, monitor, safety = self.gate, self.monitor, config.safety
         period_ns = round(S / config.camera.rate_hz)
         reaction_s = safety.dead_daemon_s
         longest_s = safety.mission_periods / self.config.camera.rate_hz
         frame_ns = round(safety.frame_periods * period_ns)
         depth_ns = round(safety.depth_periods * period_ns)
         table = [
-            Task("autopilot", lambda pulse: self.hub.run(), Reason.LINK_LOST),
+            Task("autopilot", lambda pulse: self.connection.run(), Reason.LINK_LOST),
             Task(
                 "sticks",
                 lambda pulse: sticks(
-                    self, self.track, guardian, topics, self.events, clock, config.autopilot.stick_rate_hz, pulse
+                    self, self.track, monitor, topics, self.events, clock, config.autopilot.stick_rate_hz, pulse
                 ),
                 Reason.TASK_DIED,
             ),
@@ -188,13 +188,13 @@ class Daemon:
             Task(
                 "mission",
                 lambda pulse: mission(
-                    self._strategy, self.track, self, guardian, topics, clock, reaction_s, longest_s, pulse
+                    self._strategy, self.track, self, monitor, topics, clock, reaction_s, longest_s, pulse
                 ),
                 Reason.TASK_DIED,
             ),
             Task(
                 "health",
-                lambda pulse: health(self.supervisor, guardian, topics, clock, self._tell, pulse),
+                lambda pulse: health(self.supervisor, monitor, topics, clock, self._tell, pulse),
                 Reason.TASK_DIED,
                 essential=False,
             ),
@@ -203,7 +203,7 @@ class Daemon:
             table.append(
                 Task(
                     "avoidance",
-                    lambda pulse: avoidance(self.hub, guardian, clock, pulse),
+                    lambda pulse: avoidance(self.connection, monitor, clock, pulse),
                     Reason.TASK_DIED,
                     essential=False,
                 )
@@ -212,7 +212,7 @@ class Daemon:
             table.append(
                 Task(
                     "obstacles",
-                    lambda pulse: obstacles(self.hub, topics, gate, clock, pulse),
+                    lambda pulse: obstacles(self.connection, topics, gate, clock, pulse),
                     Reason.TASK_DIED,
                     essential=False,
                 )
@@ -224,7 +224,7 @@ class Daemon:
                 Task(
                     "baseline",
                     lambda pulse: baseline(
-                        parts.servo, model, planner, first_m, topics, clock, self._heed_baseline, pulse
+                        parts.servo, model, planner, first_m, topics, clock, self.on_baseline_known, pulse
                     ),
                     Reason.SERVO_LOST,
                 )
@@ -232,25 +232,25 @@ class Daemon:
         return table
 
     def _on_vehicle(self, vehicle: VehicleState) -> None:
-        self.guardian.on_vehicle(vehicle, self._clock.now_ns())
+        self.monitor.on_vehicle(vehicle, self._clock.now_ns())
         self.track.add(vehicle)
 
     def _on_event(self, event: Event) -> None:
-        if event.source != "guardian" and event.reason in ALARMS:
-            self.guardian.alarm(event.reason, event.t_ns)
+        if event.source != "monitor" and event.reason in ALARMS:
+            self.monitor.alarm(event.reason, event.t_ns)
         if event.source == "servo":
-            self._heed_servo(event)
+            self.on_servo_event(event)
 
-    def _heed_servo(self, event: Event) -> None:
+    def on_servo_event(self, event: Event) -> None:
         """Until the Teensy answers again the eyes may be anywhere on their way, and nobody engages."""
         lost = event.reason in ALARMS
-        self.guardian.set_missing(event.reason if lost else None, "servo")
+        self.monitor.set_missing(event.reason if lost else None, "servo")
         if lost and self._model is not None:
             self._model.doubt(self._model.at(event.t_ns).target_m, event.t_ns)
 
-    def _heed_baseline(self, known: bool) -> None:
+    def on_baseline_known(self, known: bool) -> None:
         """Until the eyes are known to be somewhere, neither depth nor the checks of their pictures mean anything."""
-        self.guardian.set_missing(None if known else Reason.BASELINE_UNKNOWN, "baseline")
+        self.monitor.set_missing(None if known else Reason.BASELINE_UNKNOWN, "baseline")
 
     def _on_command(self, command: MissionCommand) -> None:
         """What a mission says beside its reason, such as the size of the gap it refuses, once."""
@@ -260,7 +260,7 @@ class Daemon:
 
     def _on_parameters(self, values: Mapping[str, float]) -> None:
         """The autopilot's own numbers, new: how it flies, where its sticks end, and whether it may be flown."""
-        self._heed_doctor(examine_parameters(values, self.config))
+        self.on_doctor_findings(examine_parameters(values, self.config))
         try:
             model = LoiterModel.from_parameters(values)
             limits = StickLimits(model.minimum, model.maximum, model.neutral)
@@ -268,13 +268,13 @@ class Daemon:
             return  # the doctor has just said so
         if self.control is not None and self.control.model == model:
             return  # the autopilot counts flight time in a parameter; the loop keeps what it has learned
-        self.control = FlightControl(model, self._governor, velocity_tuning(self.config, model))
+        self.control = StickController(model, self._governor, velocity_tuning(self.config, model))
         self.gate.set_limits(limits)
 
-    def _heed_doctor(self, findings: list[Finding]) -> None:
+    def on_doctor_findings(self, findings: list[Finding]) -> None:
         """A finding that says do not fly keeps us from engaging; a flight that is under way is not ended by it."""
         stops = tuple(finding.id for finding in findings if finding.severity is Severity.STOP)
-        self.guardian.set_missing(Reason.DOCTOR_SAYS_NO if stops else None, "doctor")
+        self.monitor.set_missing(Reason.DOCTOR_SAYS_NO if stops else None, "doctor")
         for finding in findings:
             if finding.id in stops and finding.id not in self._stops:
                 text = f"{finding.id}: {finding.evidence}; {finding.risk}; {finding.remedy}"
@@ -290,33 +290,29 @@ class Daemon:
 
     def _on_transition(self, step: Transition) -> None:
         text = f"{step.before} to {step.after}: {step.reason.text}"
-        self.events.publish(Event(step.t_ns, "guardian", step.reason, text))
+        self.events.publish(Event(step.t_ns, "monitor", step.reason, text))
         severity = 4 if step.after in (State.BRAKING, State.HOLD, State.FAULT) else 6
-        self.hub.send_statustext(severity, f"MorphEyes {step.after}: {step.reason}")
+        self.connection.send_statustext(severity, f"MorphEyes {step.after}: {step.reason}")
 
     def _tell_track(self, track: Track) -> None:
         """A moving object: for ground stations where it is and how it moves (ned), for the log its depth and sigma.
 
         Messages that the autopilot would act on (LANDING_TARGET, FOLLOW_TARGET) are left alone on purpose.
         """
-        self.hub.send_debug_vector("me_obj_p", *track.p_ned_m)
-        self.hub.send_debug_vector("me_obj_v", *track.v_ned_m_s)
-        self.hub.send_named_float("me_obj_z", track.p_rect_m[2] if track.seen else math.nan)
-        self.hub.send_named_float("me_obj_sd", math.sqrt(float(track.covariance[:3, :3].trace())))
+        self.connection.send_debug_vector("me_obj_p", *track.p_ned_m)
+        self.connection.send_debug_vector("me_obj_v", *track.v_ned_m_s)
+        self.connection.send_named_float("me_obj_z", track.p_rect_m[2] if track.seen else math.nan)
+        self.connection.send_named_float("me_obj_sd", math.sqrt(float(track.covariance[:3, :3].trace())))
 
     def _tell(self, report: Health) -> None:
         """Into the autopilot's own log: state, reason, baseline, nearest depth, frame age."""
-        self.hub.send_named_int("me_state", STATE_NUMBERS[report.state])
-        self.hub.send_named_int("me_reason", report.reason.number)
+        self.connection.send_named_int("me_state", STATE_NUMBERS[report.state])
+        self.connection.send_named_int("me_reason", report.reason.number)
         estimate, seen = self.topics.baseline.get(), self.topics.perception.get()
         if estimate is not None:
-            self.hub.send_named_float("me_base", estimate.baseline_m)
+            self.connection.send_named_float("me_base", estimate.baseline_m)
         if seen is not None:
-            self.hub.send_named_float("me_near", seen.summary.nearest_m)
-        self.hub.send_named_float("me_age", report.ages_s["frame"])
+            self.connection.send_named_float("me_near", seen.summary.nearest_m)
+        self.connection.send_named_float("me_age", report.ages_s["frame"])
         with contextlib.suppress(OSError):
             self._parts.tell(report)
-
-
-
-

@@ -70,7 +70,7 @@ def build_parts(
     """
     pipeline = PipelineFactory(config, mission, calibration_file(config))
 
-    def mourn(text: str) -> None:
+    def on_worker_death(text: str) -> None:
         events.publish(Event(clock.now_ns(), "vision", Reason.WORKER_LOST, text))
 
     log_hz = config.recorder.image_rate_hz if config.recorder.images else 0.0
@@ -81,7 +81,7 @@ def build_parts(
         camera=build_camera(config.camera, clock),
         servo=build_servo(config.servo, open_link, clock, events),
         opener=open_link,
-        worker=ProcessWorker(pipeline, job_timeout_s=JOB_TIMEOUT_S, on_idle_death=mourn),
+        worker=ProcessWorker(pipeline, job_timeout_s=JOB_TIMEOUT_S, on_idle_death=on_worker_death),
         image_rate_hz=max(log_hz, page_hz),
         tell=tell,
     )
@@ -99,7 +99,7 @@ async def serve(config: VehicleConfig, mission_name: str, mission: MissionFile, 
     stop = asyncio.Event()
     with ending_by_signal(stop), closing(_recorder(daemon, mission_name, mission, clock)) as recorder:
         say(f"mission {mission_name}, calibration {config.calibration}, log {recorder.path}")
-        _heed_calibration(daemon, clock)
+        check_calibration(daemon, clock)
         await daemon.run(stop)
         notify("STOPPING=1")
 
@@ -142,16 +142,12 @@ def ending_by_signal(stop: asyncio.Event) -> Iterator[None]:
             loop.remove_signal_handler(number)
 
 
-
-
-
-
-def _heed_calibration(daemon: Daemon, clock: Clock) -> None:
+def check_calibration(daemon: Daemon, clock: Clock) -> None:
     """What the doctor says against the calibration keeps the daemon from engaging."""
     findings, _ = examine_calibration(daemon.config)
     for finding in findings:
         if finding.severity is Severity.STOP:
-            daemon.guardian.set_missing(Reason.DOCTOR_SAYS_NO, "calibration")
+            daemon.monitor.set_missing(Reason.DOCTOR_SAYS_NO, "calibration")
             text = f"{finding.id}: {finding.evidence}; {finding.remedy}"
             daemon.events.publish(Event(clock.now_ns(), "doctor", Reason.DOCTOR_SAYS_NO, text))
 
@@ -188,7 +184,7 @@ def _companions(daemon: Daemon, mission_name: str, clock: Clock) -> list[Task]:
 
         tasks.append(Task("dashboard", show, Reason.TASK_DIED, essential=False))
     if config.autopilot.mavsdk:
-        bridge = MavsdkBridge(daemon.hub, config.autopilot, clock)
+        bridge = MavsdkBridge(daemon.connection, config.autopilot, clock)
 
         async def listen(pulse: Pulse) -> None:
             await bridge.run()

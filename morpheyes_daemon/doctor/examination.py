@@ -76,7 +76,7 @@ async def _take_over(
     if stopped:
         report.add("take-over", [_untested(stopped[0])])
         return
-    test = TakeoverTest(vehicle.hub, vehicle.hub.claim_stick_output(), config.autopilot, clock, tell)
+    test = TakeoverTest(vehicle.connection, vehicle.connection.claim_stick_output(), config.autopilot, clock, tell)
     report.handovers, findings = await test.run()
     report.add("take-over", findings)
 

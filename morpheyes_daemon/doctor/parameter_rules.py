@@ -75,9 +75,7 @@ def examine_parameters(values: Mapping[str, float], config: VehicleConfig) -> li
         except DeviceError:
             continue  # a parameter it needs does not exist; that it does not is the sticks' finding
         if evidence is not None:
-            findings.append(
-                Finding(rule.id, rule.severity, evidence, rule.risk, rule.remedy, rule.changes(subject))
-            )
+            findings.append(Finding(rule.id, rule.severity, evidence, rule.risk, rule.remedy, rule.changes(subject)))
     return [finding for finding in findings if finding is not None]
 
 

@@ -132,9 +132,7 @@ async def examine_servo(servo: Servo, config: VehicleConfig) -> tuple[list[Findi
     return [], True
 
 
-async def examine_camera(
-    build: Callable[[], Camera], config: VehicleConfig, rig: RigModel | None
-) -> list[Finding]:
+async def examine_camera(build: Callable[[], Camera], config: VehicleConfig, rig: RigModel | None) -> list[Finding]:
     """Read some pairs and judge rate and content; with `rig` (eyes at the smallest baseline) match one."""
     try:
         pairs = await _read(build())

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from morpheyes_daemon.clock import MS, Clock, S, Ticker
 from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.control.loiter import LoiterModel, Widths
-from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import VehicleState
@@ -46,18 +46,18 @@ class TakeoverTest:
 
     def __init__(
         self,
-        hub: AutopilotHub,
+        connection: AutopilotConnection,
         output: Callable[[ChannelOverride], None],
         config: AutopilotConfig,
         clock: Clock,
         say: Callable[[str], None],
     ) -> None:
-        """`output` is the hub's claimed stick output. The hub must have read the parameters."""
+        """`output` is the connection's claimed stick output. The connection must have read the parameters."""
         self._output = output
         self._config = config
         self._clock = clock
         self._say = say
-        model = LoiterModel.from_parameters(hub.parameters.values)
+        model = LoiterModel.from_parameters(connection.parameters.values)
         roll, pitch, _, yaw = model.neutral
         self._marked: Widths = model.channels((roll + MARK_US, pitch, max(THROTTLE_LOW_US, model.minimum[2]), yaw))
         self._state = VehicleState()
@@ -65,7 +65,7 @@ class TakeoverTest:
         self._heard_ns = 0
         self._own_ns = 0
         self._released = 0
-        hub.on_vehicle(self._hear)
+        connection.on_vehicle(self._hear)
 
     async def run(self) -> tuple[list[HandOver], list[Finding]]:
         """Return the measured hand-overs, and what did not work."""

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config.vehicle import VehicleConfig
-from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
 from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.doctor.findings import Finding, Severity
@@ -30,7 +30,7 @@ PRE_ARM = "PreArm: "
 
 
 class VehicleExamination:
-    """Holds the hub for one examination; use it as an async context manager, then `examine`."""
+    """Holds the connection for one examination; use it as an async context manager, then `examine`."""
 
     def __init__(self, config: VehicleConfig, clock: Clock, opener: LinkOpener) -> None:
         self._config = config
@@ -38,14 +38,14 @@ class VehicleExamination:
         self._topics, self._events = Topics.create(), EventLog()
         self._last_event: Event | None = None
         self._events.subscribe(self._remember)
-        self.hub = AutopilotHub(config.autopilot, clock, self._topics, self._events, opener)
+        self.connection = AutopilotConnection(config.autopilot, clock, self._topics, self._events, opener)
         self._stamps: dict[str, set[int]] = {name: set() for name in SLOWEST_HZ}
         self._words: list[str] = []
         self._bridge: MavsdkBridge | None = None
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self) -> VehicleExamination:
-        self._tasks = [asyncio.create_task(self.hub.run(), name="autopilot")]
+        self._tasks = [asyncio.create_task(self.connection.run(), name="autopilot")]
         return self
 
     async def __aexit__(self, *error: object) -> None:
@@ -55,7 +55,7 @@ class VehicleExamination:
 
     def with_mavsdk(self) -> None:
         """Let mavsdk listen too; it needs real time."""
-        self._bridge = MavsdkBridge(self.hub, self._config.autopilot, self._clock)
+        self._bridge = MavsdkBridge(self.connection, self._config.autopilot, self._clock)
         self._tasks.append(asyncio.create_task(self._bridge.run(), name="mavsdk"))
 
     @property
@@ -65,17 +65,17 @@ class VehicleExamination:
 
     async def examine(self) -> list[Finding]:
         """Return the findings on link, parameters, state and the autopilot's own checks."""
-        if not await self.wait(lambda: self.hub.up, LINK_S):
+        if not await self.wait(lambda: self.connection.up, LINK_S):
             return [self._missing()]
-        if not await self.wait(lambda: self.hub.parameters.complete, PARAMETERS_S):
+        if not await self.wait(lambda: self.connection.parameters.complete, PARAMETERS_S):
             return [self._unread()]
         await self.wait(lambda: self.vehicle.attitude_t_ns > 0, FIRST_STREAM_S)
-        self.hub.on_text(self._listen)
+        self.connection.on_text(self._listen)
         await self._ask_for_checks()
-        self.hub.on_vehicle(self._count)
+        self.connection.on_vehicle(self._count)
         await self._clock.sleep_until_ns(self._clock.now_ns() + round(LISTEN_S * S))
         return [
-            *examine_parameters(self.hub.parameters.values, self._config),
+            *examine_parameters(self.connection.parameters.values, self._config),
             *self._streams(),
             *self._state(),
             *self._own_checks(),
@@ -83,7 +83,7 @@ class VehicleExamination:
         ]
 
     async def wait(self, done: Callable[[], bool], limit_s: float) -> bool:
-        """Wait until `done()` is true or `limit_s` is over and return which; what ended the hub is raised here."""
+        """Wait until `done()` is true or `limit_s` is over and return which; what ended the connection is raised here."""
         end_ns = self._clock.now_ns() + round(limit_s * S)
         while not done():
             if self._tasks[0].done():
@@ -106,7 +106,7 @@ class VehicleExamination:
 
     async def _ask_for_checks(self) -> None:
         try:
-            await self.hub.send_command(dialect.MAV_CMD_RUN_PREARM_CHECKS)
+            await self.connection.send_command(dialect.MAV_CMD_RUN_PREARM_CHECKS)
         except DeviceError:
             pass  # older firmware says its words unasked, every 30 s
 
@@ -124,7 +124,7 @@ class VehicleExamination:
         return Finding(
             "parameters-unread",
             Severity.STOP,
-            f"{len(self.hub.parameters.values)} parameters came in {PARAMETERS_S:g} s, then no more",
+            f"{len(self.connection.parameters.values)} parameters came in {PARAMETERS_S:g} s, then no more",
             "stick ranges and braking of this vehicle are unknown",
             "raise the baud rate of the link (921600) or shorten the radio path",
         )

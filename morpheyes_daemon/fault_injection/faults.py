@@ -1,6 +1,6 @@
 """What each fault of the matrix does to a simulated flight, and how it is mended where it is.
 
-One function per fault, each a few lines on the places where something can break (`FaultFlight`, `sabotage`, the
+One function per fault, each a few lines on the places where something can break (`FaultFlight`, `injectors`, the
 twins' own fault hooks). What must follow stands in `faults.py`.
 """
 
@@ -15,7 +15,7 @@ from dataclasses import replace
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from morpheyes_daemon.fault_injection import injectors as sabotage
+from morpheyes_daemon.fault_injection import injectors
 from morpheyes_daemon.fault_injection.harness import FaultFlight
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
@@ -52,7 +52,7 @@ def plug_camera_in(flight: FaultFlight) -> None:
     flight.camera.plugged = True
 
 
-def retouch(retouched: Callable[[], sabotage.Retouch]) -> Act:
+def retouch(retouched: Callable[[], injectors.Retouch]) -> Act:
     """Have every pair changed from now on."""
 
     def act(flight: FaultFlight) -> None:
@@ -128,19 +128,19 @@ def reboot_servo(flight: FaultFlight) -> None:
 
 
 def lose_link(flight: FaultFlight) -> None:
-    flight.wire.incoming = flight.wire.outgoing = sabotage.lose
+    flight.wire.incoming = flight.wire.outgoing = injectors.lose
 
 
 def lose_downlink(flight: FaultFlight) -> None:
-    flight.wire.incoming = sabotage.lose
+    flight.wire.incoming = injectors.lose
 
 
 def lose_uplink(flight: FaultFlight) -> None:
-    flight.wire.outgoing = sabotage.lose
+    flight.wire.outgoing = injectors.lose
 
 
 def mend_link(flight: FaultFlight) -> None:
-    flight.wire.incoming = flight.wire.outgoing = sabotage.pass_on
+    flight.wire.incoming = flight.wire.outgoing = injectors.pass_on
 
 
 def unplug_link(flight: FaultFlight) -> None:
@@ -148,19 +148,19 @@ def unplug_link(flight: FaultFlight) -> None:
 
 
 def noisy_link(flight: FaultFlight) -> None:
-    flight.wire.incoming = sabotage.add_noise(flight.rng)
+    flight.wire.incoming = injectors.add_noise(flight.rng)
 
 
 def cutting_link(flight: FaultFlight) -> None:
-    flight.wire.incoming = sabotage.cut_short(flight.rng)
+    flight.wire.incoming = injectors.cut_short(flight.rng)
 
 
 def swapping_link(flight: FaultFlight) -> None:
-    flight.wire.incoming = sabotage.swap_neighbours()
+    flight.wire.incoming = injectors.swap_neighbours()
 
 
 def doubling_link(flight: FaultFlight) -> None:
-    flight.wire.incoming = flight.wire.outgoing = sabotage.double
+    flight.wire.incoming = flight.wire.outgoing = injectors.double
 
 
 def forge(flight: FaultFlight) -> None:

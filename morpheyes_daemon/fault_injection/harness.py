@@ -29,8 +29,8 @@ from morpheyes_daemon.flights.lockstep import (
     make_crew,
     memory_opener,
 )
-from morpheyes_daemon.flights.render_cache import SharedStage
-from morpheyes_daemon.flights.sim_vehicle import Stage, StageCamera
+from morpheyes_daemon.flights.render_cache import CachedVehicle
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle, SimVehicleCamera
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
@@ -97,12 +97,12 @@ class FaultFlight:
         self.rng = random.Random(f"faults {plan.scenario.seed}")
         topics, events = Topics.create(), EventLog()
         self.topics = topics
-        self.stage = SharedStage(plan.scenario, plan.config, self.clock, folder)
+        self.stage = CachedVehicle(plan.scenario, plan.config, self.clock, folder)
         self.stage.autopilot.parameters.set("RSSI_TYPE", 3)
         self.crew = make_crew(self.stage)
         opener = memory_opener(self.stage)
         self.wire, self.servo_wire = Wire(opener), Wire(opener)
-        self.camera = FaultyCamera(StageCamera(self.stage, plan.config.camera.rate_hz))
+        self.camera = FaultyCamera(SimVehicleCamera(self.stage, plan.config.camera.rate_hz))
         pipeline = PipelineFactory(plan.config, plan.mission, plan.calibration)()
         latency_ns = round(plan.config.stereo.latency_ms * S / 1e3)
         self.worker = FaultyWorker(InlineWorker(pipeline.perceive, latency_ns, self.clock), self.clock)
@@ -141,7 +141,7 @@ class FaultFlight:
     @property
     def state(self) -> State:
         """Where the daemon is."""
-        return self.daemon.guardian.state
+        return self.daemon.monitor.state
 
     @property
     def sent(self) -> list[tuple[int, Sent]]:
@@ -176,7 +176,7 @@ class FaultFlight:
         end_ns = self.clock.now_ns() + round(limit_s * S)
         while not done():
             if self.clock.now_ns() > end_ns:
-                reason = self.daemon.guardian.reason.text
+                reason = self.daemon.monitor.reason.text
                 raise DeviceTimeoutError(f"The flight did not get there: it is in {self.state} ({reason}).")
             await self.sleep(0.02)
 
@@ -225,7 +225,7 @@ class FaultFlight:
         after = [kind for t_s, kind in sent if quiet and t_s > quiet[0]]
         return Measured(
             state=self.state,
-            reason=self.daemon.guardian.reason,
+            reason=self.daemon.monitor.reason,
             reaction_s=quiet[0] if quiet else None,
             quiet_s=_quiet_s(sent),
             release_s=released[0] if released else None,
@@ -270,7 +270,7 @@ class TruePath:
     drifts.
     """
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: SimVehicle) -> None:
         self._stage = stage
         self._last: tuple[float, float] | None = None
         self._flown_m = 0.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from morpheyes_daemon.fault_injection import faults as acts
-from morpheyes_daemon.fault_injection import injectors as sabotage
+from morpheyes_daemon.fault_injection import injectors
 from morpheyes_daemon.fault_injection.expectations import Ending, Fault
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
@@ -74,21 +74,21 @@ FAULTS: tuple[Fault, ...] = (
         "the same picture for ever",
         DEPTH_S + PICTURE_S,
         _STOPPED,
-        acts.retouch(sabotage.frozen_picture),
+        acts.retouch(injectors.frozen_picture),
     ),
     Fault(
         "eyes-swapped",
         "left and right exchanged",
         DEPTH_S + PICTURE_S,
         _STOPPED,
-        acts.retouch(lambda: sabotage.swapped_eyes),
+        acts.retouch(lambda: injectors.swapped_eyes),
     ),
     Fault(
         "eye-black",
         "the right eye sees nothing",
         DEPTH_S + PICTURE_S,
         _STOPPED,
-        acts.retouch(lambda: sabotage.black_eye),
+        acts.retouch(lambda: injectors.black_eye),
     ),
     Fault("image-burnt", "exposure burnt out", DEPTH_S + PICTURE_S, _STOPPED, acts.burn_out),
     Fault("desync-5ms", "the right eye 5 ms late", 0.0, _PERHAPS, acts.desynchronize(5.0)),

@@ -11,7 +11,7 @@ import numpy as np
 from morpheyes_daemon.clock import S, wall_time_s
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.lockstep import FlightPlan, Summary, Watchers
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
@@ -55,7 +55,7 @@ def wall_plan(gap: GapTruth, t_s: float) -> tuple[Polygon, ...]:
     return tuple(pieces)
 
 
-class FlightOutputs:
+class FlightArtifacts:
     """Attach to a flight's watchers, then `finish` with its summary."""
 
     def __init__(self, folder: Path, plan: FlightPlan) -> None:
@@ -65,7 +65,7 @@ class FlightOutputs:
         self._recorder: Recorder | None = None
         self._film: FlightFilm | None = None
         self._scene = Scene()
-        self._stage: Stage | None = None
+        self._stage: SimVehicle | None = None
         self._through_s: float | None = None
 
     def watch(self, watchers: Watchers) -> None:
@@ -94,7 +94,7 @@ class FlightOutputs:
         draw_strips(self._folder / "strips.png", self._series, title=title)
         (self._folder / "summary.json").write_text(json.dumps(summary.as_json(), indent=2) + "\n", encoding="utf-8")
 
-    def _attach(self, daemon: Daemon, stage: Stage) -> None:
+    def _attach(self, daemon: Daemon, stage: SimVehicle) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         for name in FILES:
             (self._folder / name).unlink(missing_ok=True)
@@ -123,7 +123,7 @@ class FlightOutputs:
         self._film.watch(daemon.topics)
         daemon.topics.vehicle.tap(lambda state: self._note_truth(state, stage))
 
-    def _note_truth(self, state: VehicleState, stage: Stage) -> None:
+    def _note_truth(self, state: VehicleState, stage: SimVehicle) -> None:
         now_ns = stage.clock.now_ns()
         truth = self._series.truth
         if not truth or now_ns - truth[-1][0] >= S // 20:
@@ -131,7 +131,7 @@ class FlightOutputs:
             self._series.add_truth(now_ns, p_ned_m)
             self._note_wall(p_ned_m, stage, now_ns)
 
-    def _note_wall(self, p_ned_m: Sequence[float], stage: Stage, now_ns: int) -> None:
+    def _note_wall(self, p_ned_m: Sequence[float], stage: SimVehicle, now_ns: int) -> None:
         """Keep the time when the vehicle reaches a wall: on the map a wall that sways stands as it was then."""
         t_s = stage.world_s(now_ns)
         for gap in stage.world.gaps[:1]:

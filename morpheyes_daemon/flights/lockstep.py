@@ -28,8 +28,8 @@ from morpheyes_daemon.daemon.composition import Daemon, Parts
 from morpheyes_daemon.devices.link import Link, LinkOpener, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceNotFoundError
-from morpheyes_daemon.flights.referee import Judge, Outcome, Reported, Verdict
-from morpheyes_daemon.flights.sim_vehicle import Scenario, Stage, StageCamera
+from morpheyes_daemon.flights.referee import Outcome, Referee, Reported, Verdict
+from morpheyes_daemon.flights.sim_vehicle import Scenario, SimVehicle, SimVehicleCamera
 from morpheyes_daemon.messages.core import Event, StereoFrame
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import GateOutput, State
@@ -96,7 +96,7 @@ class Summary:
 class Watchers:
     """What looks on while a flight goes: pictures, recorder, progress. Each may tap topics; none is asked."""
 
-    attach: list[Callable[[Daemon, Stage], None]] = field(default_factory=list)
+    attach: list[Callable[[Daemon, SimVehicle], None]] = field(default_factory=list)
     image_rate_hz: float = 0.0
     progress: Callable[[Progress], None] = lambda progress: None
 
@@ -112,9 +112,7 @@ class Progress:
     baseline_m: float
 
 
-def sim_config(
-    config: VehicleConfig, rate_hz: float, size: tuple[int, int], baseline_m: float | None
-) -> VehicleConfig:
+def sim_config(config: VehicleConfig, rate_hz: float, size: tuple[int, int], baseline_m: float | None) -> VehicleConfig:
     """Return a vehicle configuration with the simulator's camera, servo and link in place of the real ones."""
     camera = SimCameraConfig(
         width_px=size[0],
@@ -146,7 +144,7 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     topics, events = Topics.create(), EventLog()
     troubles: dict[str, str] = {}
     events.subscribe(lambda event: note_trouble(troubles, event))
-    stage = Stage(plan.scenario, plan.config, clock, plan.threads)
+    stage = SimVehicle(plan.scenario, plan.config, clock, plan.threads)
     crew = make_crew(stage)
     opener = memory_opener(stage)
     pipeline = PipelineFactory(plan.config, plan.mission, plan.calibration)()
@@ -154,7 +152,7 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     pool = ThreadPoolExecutor(1) if plan.threads > 1 else None
     parts = Parts(
         clock=clock,
-        camera=StageCamera(stage, plan.config.camera.rate_hz),
+        camera=SimVehicleCamera(stage, plan.config.camera.rate_hz),
         servo=build_servo(plan.config.servo, opener, clock, events),
         opener=opener,
         worker=InlineWorker(pipeline.perceive, latency_ns, clock, pool),
@@ -164,7 +162,7 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     tally = Tally(topics, events)
     for attach in watchers.attach:
         attach(daemon, stage)
-    judge = Judge(stage, daemon.guardian, topics.gate, plan.limit_s)
+    judge = Referee(stage, daemon.monitor, topics.gate, plan.limit_s)
     stop = asyncio.Event()
     background = [
         asyncio.create_task(job)
@@ -172,7 +170,7 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     ]
     running = asyncio.create_task(daemon.run(stop))
     watching = asyncio.create_task(judge.watch())
-    conducting = asyncio.create_task(conduct(crew, daemon.guardian, clock.sleep_until_ns, clock.now_ns, troubles))
+    conducting = asyncio.create_task(conduct(crew, daemon.monitor, clock.sleep_until_ns, clock.now_ns, troubles))
     try:
         done, _ = await asyncio.wait({running, watching, conducting}, return_when=asyncio.FIRST_COMPLETED)
         if conducting in done:
@@ -211,7 +209,7 @@ class Crew(Protocol):
 
 async def conduct(
     crew: Crew,
-    guardian: Reported,
+    monitor: Reported,
     sleep_until_ns: Callable[[int], Any],
     now_ns: Callable[[], int],
     troubles: Mapping[str, str] | None = None,
@@ -222,9 +220,9 @@ async def conduct(
     """
     await crew.take_off(TAKE_OFF_HEIGHT_M)
     limit_ns = now_ns() + round(READY_LIMIT_S * S)
-    while guardian.state is not State.STANDBY:
+    while monitor.state is not State.STANDBY:
         if now_ns() > limit_ns:
-            why = next(iter((troubles or {}).values()), guardian.reason.text).rstrip(".")
+            why = next(iter((troubles or {}).values()), monitor.reason.text).rstrip(".")
             raise DeviceNotFoundError(f"The daemon did not get ready within {READY_LIMIT_S:.0f} s: {why}.")
         await sleep_until_ns(now_ns() + S // 20)
     crew.engage()
@@ -265,7 +263,7 @@ class Tally:
         return self._said.get(reason, "")
 
     def _event(self, event: Event) -> None:
-        if event.source != "guardian":  # whose text is the reason's own
+        if event.source != "monitor":  # whose text is the reason's own
             self._said[event.reason] = event.text
 
     def _frame(self, frame: StereoFrame) -> None:
@@ -277,9 +275,7 @@ class Tally:
         self._hash.update(f"{out.t_ns} {out.action} {out.widths_us}\n".encode())
 
 
-def summarize_flight(
-    plan: FlightPlan, verdict: Verdict, tally: Tally, simulated_s: float, wall_s: float
-) -> Summary:
+def summarize_flight(plan: FlightPlan, verdict: Verdict, tally: Tally, simulated_s: float, wall_s: float) -> Summary:
     """Put the judge's verdict and the counts into the row of one flight."""
     hold_mm = plan.config.hold_baseline_mm
     camera = plan.config.camera
@@ -310,7 +306,7 @@ def summarize_flight(
     )
 
 
-def make_crew(stage: Stage) -> GroundCrew:
+def make_crew(stage: SimVehicle) -> GroundCrew:
     """Return a ground crew with an in-memory link of its own."""
     ours, theirs = MemoryLink.pair(LINK_DELAY_S)
     crew = GroundCrew(stage.radio, ours, stage.clock, without_gps=stage.autopilot.parameters.flow_only)
@@ -319,8 +315,9 @@ def make_crew(stage: Stage) -> GroundCrew:
     return crew
 
 
-def memory_opener(stage: Stage) -> LinkOpener:
+def memory_opener(stage: SimVehicle) -> LinkOpener:
     """Return what opens the daemon's links to the autopilot and the Teensy of `stage`."""
+
     async def open_memory(url: str, on_bytes: OnBytes, on_lost: OnLost) -> Link:
         ours, theirs = MemoryLink.pair(LINK_DELAY_S)
         ours.on_bytes, ours.on_lost = on_bytes, on_lost
@@ -336,14 +333,14 @@ def memory_opener(stage: Stage) -> LinkOpener:
     return open_memory
 
 
-async def _report(stage: Stage, daemon: Daemon, watchers: Watchers, began_ns: int) -> None:
+async def _report(stage: SimVehicle, daemon: Daemon, watchers: Watchers, began_ns: int) -> None:
     clock = stage.clock
     while True:
         now_ns = clock.now_ns()
         truth = stage.truth(now_ns)
         distance = stage.world.to_goal_m(truth.p_ned_m)
         speed = (truth.v_ned_m_s[0] ** 2 + truth.v_ned_m_s[1] ** 2) ** 0.5
-        phase = str(daemon.guardian.state)
+        phase = str(daemon.monitor.state)
         watchers.progress(Progress((now_ns - began_ns) / S, phase, distance, speed, stage.baseline_m(now_ns)))
         await clock.sleep_until_ns(now_ns + S // 2)
 

@@ -27,7 +27,7 @@ from morpheyes_daemon.flights.artifacts import FILES
 from morpheyes_daemon.flights.lockstep import FlightPlan, Progress, Summary, Tally, summarize_flight
 from morpheyes_daemon.flights.referee import Verdict
 from morpheyes_daemon.flights.simulator_process import End, PilotAct, Ready, SimulatorJob, simulate
-from morpheyes_daemon.flights.stick_timing import StickBeat, StickIntervals
+from morpheyes_daemon.flights.stick_timing import StickIntervals, StickTiming
 from morpheyes_daemon.messages.core import Perception
 from morpheyes_daemon.messages.safety import GateOutput
 from morpheyes_daemon.perception.pipeline import VisionJob
@@ -188,7 +188,7 @@ class RealtimeFlight:
     simulator: Simulator
     running: asyncio.Task[None]
     tally: Tally
-    beat: StickBeat
+    beat: StickTiming
 
     async def verdict(self) -> Verdict:
         """Wait for the judge; raises what ended the simulator or the daemon before."""
@@ -216,7 +216,7 @@ async def realtime_daemon(
             worker = parts.worker
             assert isinstance(worker, ProcessWorker)
             daemon = Daemon(config, plan.mission, parts, topics, events)
-            watchers = Tally(topics, events), StickBeat(topics.gate)
+            watchers = Tally(topics, events), StickTiming(topics.gate)
             topics.gate.tap(simulator.tell)
             with closing(_recorder(plan, config, daemon, log, ready.scene_json)):
                 stop = asyncio.Event()

@@ -9,10 +9,10 @@ from typing import Protocol
 
 from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.clock import S, Ticker
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import GateOutput, State
-from morpheyes_daemon.safety.monitor import NOT_RESUMED
+from morpheyes_daemon.safety.monitor import REQUESTED_STOPS
 
 RATE_HZ = 50.0
 GOAL_TOLERANCE_M = 4.0
@@ -47,7 +47,7 @@ class Verdict:
 
 
 class Reported(Protocol):
-    """What the daemon says of itself: its guardian, or what was heard of it in another process."""
+    """What the daemon says of itself: its monitor, or what was heard of it in another process."""
 
     @property
     def state(self) -> State:
@@ -62,12 +62,12 @@ class Reported(Protocol):
         """Since when."""
 
 
-class Judge:
+class Referee:
     """Watches one flight."""
 
-    def __init__(self, stage: Stage, guardian: Reported, gate: Latest[GateOutput], limit_s: float) -> None:
+    def __init__(self, stage: SimVehicle, monitor: Reported, gate: Latest[GateOutput], limit_s: float) -> None:
         self._stage = stage
-        self._guardian = guardian
+        self._guardian = monitor
         self._limit_s = limit_s
         self._engaged = False
         self._engaged_ns = 0
@@ -128,7 +128,7 @@ class Judge:
             return Outcome.ABORTED, f"believed to be at the goal, {off_m:.1f} m from it"
         if reason is Reason.MISSION_REFUSED:
             return Outcome.REFUSED, reason
-        if reason not in NOT_RESUMED and now_ns - self._guardian.since_ns > GIVEN_UP_S * S:
+        if reason not in REQUESTED_STOPS and now_ns - self._guardian.since_ns > GIVEN_UP_S * S:
             return Outcome.ABORTED, reason
         return None
 
@@ -147,6 +147,6 @@ class Judge:
     def _count(self, out: GateOutput) -> None:
         # a mission that refuses at once is engaged for one stick period, which the ticker may miss
         self._engaged |= out.state is State.ENGAGED
-        if out.state is State.BRAKING and self._state is not State.BRAKING and out.reason not in NOT_RESUMED:
+        if out.state is State.BRAKING and self._state is not State.BRAKING and out.reason not in REQUESTED_STOPS:
             self._braking += 1
         self._state = out.state

@@ -15,12 +15,12 @@ import numpy as np
 
 from morpheyes_daemon.clock import Clock
 from morpheyes_daemon.config.vehicle import VehicleConfig
-from morpheyes_daemon.flights.sim_vehicle import Scenario, Stage
+from morpheyes_daemon.flights.sim_vehicle import Scenario, SimVehicle
 from morpheyes_daemon.messages.core import RawPair, frozen
 
 
-class SharedStage(Stage):
-    """A `Stage` of one world and rig with its own `folder`; it renders in one thread, since threads end at a fork."""
+class CachedVehicle(SimVehicle):
+    """A `SimVehicle` of one world and rig with its own `folder`; it renders in one thread, since threads end at a fork."""
 
     def __init__(self, scenario: Scenario, config: VehicleConfig, clock: Clock, folder: Path) -> None:
         super().__init__(scenario, config, clock)

@@ -67,7 +67,7 @@ class FlyingVehicle(Protocol):
         """Return where the vehicle was; InputError when that is not known."""
 
 
-class Stage:
+class SimVehicle:
     """One simulated flight's truth; `vehicle` takes the place of the autopilot twin."""
 
     def __init__(
@@ -144,10 +144,10 @@ class Stage:
         self.camera.close()
 
 
-class StageCamera:
+class SimVehicleCamera:
     """The `sim` camera of a daemon on the same loop: exposures on a grid, delivered a little later."""
 
-    def __init__(self, stage: Stage, rate_hz: float) -> None:
+    def __init__(self, stage: SimVehicle, rate_hz: float) -> None:
         self._stage = stage
         self._period_ns = round(S / rate_hz)
         self._seq = 0

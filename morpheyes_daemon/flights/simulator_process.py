@@ -23,8 +23,8 @@ from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.errors import MorphEyesError
 from morpheyes_daemon.flights.artifacts import scene_of
 from morpheyes_daemon.flights.lockstep import Crew, Progress, conduct, make_crew
-from morpheyes_daemon.flights.referee import Judge
-from morpheyes_daemon.flights.sim_vehicle import Scenario, Stage
+from morpheyes_daemon.flights.referee import Referee
+from morpheyes_daemon.flights.sim_vehicle import Scenario, SimVehicle
 from morpheyes_daemon.flights.sitl import open_sitl
 from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.messages.reasons import Reason
@@ -131,20 +131,18 @@ async def _simulate(job: SimulatorJob, pipe: Connection) -> None:
     if job.sitl is not None:
         async with open_sitl(job.sitl, clock) as (vehicle, crew):
             # in a thread, since the SITL goes on talking
-            stage = await asyncio.to_thread(
-                Stage, job.scenario, job.config, clock, job.render_threads, vehicle
-            )
+            stage = await asyncio.to_thread(SimVehicle, job.scenario, job.config, clock, job.render_threads, vehicle)
             vehicle.stand_at(*stage.world.start_ned_m[:2])
             await _fly(job, pipe, stage, crew, job.sitl)
             await crew.land()
         return
-    stage = TwinStage(job.scenario, job.config, clock, job.render_threads)
+    stage = TwinVehicle(job.scenario, job.config, clock, job.render_threads)
     station = make_crew(stage)
     async with MavlinkServer(stage.autopilot, port=0) as server, _background(stage.autopilot.run(), station.run()):
         await _fly(job, pipe, stage, station, server.url)
 
 
-class TwinStage(Stage):
+class TwinVehicle(SimVehicle):
     """A stage whose twin is brought up to the moment it is asked about, should the loop have been held up."""
 
     def truth(self, t_ns: int) -> Truth:
@@ -154,7 +152,7 @@ class TwinStage(Stage):
         return super().truth(t_ns)
 
 
-async def _fly(job: SimulatorJob, pipe: Connection, stage: Stage, crew: Crew, url: str) -> None:
+async def _fly(job: SimulatorJob, pipe: Connection, stage: SimVehicle, crew: Crew, url: str) -> None:
     clock, heard = stage.clock, Heard(stage.radio)
     port = PseudoTerminal(stage.teensy.receive)
     stage.teensy.connect(port.write)
@@ -176,9 +174,9 @@ async def _fly(job: SimulatorJob, pipe: Connection, stage: Stage, crew: Crew, ur
         stage.close()
 
 
-async def _judge(job: SimulatorJob, pipe: Connection, stage: Stage, crew: Crew, heard: Heard) -> None:
+async def _judge(job: SimulatorJob, pipe: Connection, stage: SimVehicle, crew: Crew, heard: Heard) -> None:
     """Hand over, and send the verdict when there is one; over when the daemon ends before."""
-    judge = Judge(stage, heard, heard.gate, job.limit_s)
+    judge = Referee(stage, heard, heard.gate, job.limit_s)
     watching = asyncio.create_task(judge.watch())
     conducting = asyncio.create_task(conduct(crew, heard, stage.clock.sleep_until_ns, stage.clock.now_ns))
     ended = asyncio.create_task(heard.ended.wait())
@@ -199,7 +197,7 @@ async def _judge(job: SimulatorJob, pipe: Connection, stage: Stage, crew: Crew, 
 class Exposures:
     """Renders pairs in a thread, so that the vehicle goes on flying meanwhile."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: SimVehicle) -> None:
         self._stage = stage
         self._seq = 0
 
@@ -214,7 +212,7 @@ class Exposures:
         return await asyncio.to_thread(stage.exposure(self._seq, t_ns))
 
 
-async def _report(stage: Stage, heard: Heard, pipe: Connection, began_ns: int) -> None:
+async def _report(stage: SimVehicle, heard: Heard, pipe: Connection, began_ns: int) -> None:
     clock: Clock = stage.clock
     while True:
         await stage.vehicle.catch_up()

@@ -44,7 +44,7 @@ class StickIntervals:
     stolen_s: float = 0.0
 
 
-class StickBeat:
+class StickTiming:
     """Listens to the gate from construction on; `stolen` tells the processor time taken by the host so far."""
 
     def __init__(self, gate: Latest[GateOutput], stolen: Callable[[], float] = stolen_s) -> None:

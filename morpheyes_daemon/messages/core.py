@@ -92,7 +92,7 @@ class DepthMap:
     """Depth of every pixel of the rectified left eye, (H, W) float32 metres along z, NaN unknown.
 
     `near` (H, W) bool: unknown because closer than `near_limit_m` (at the disparity ceiling).
-    `one_eyed` (H, W) bool: unknown because only the left eye sees it.
+    `half_occluded` (H, W) bool: unknown because only the left eye sees it.
     `sigma_disparity_px` and the baseline's sigma give eps_z by `stereo.depth.depth_sigma`.
     """
 
@@ -100,7 +100,7 @@ class DepthMap:
     t_ns: int
     depth_m: FloatMap
     near: NDArray[np.bool_]
-    one_eyed: NDArray[np.bool_]
+    half_occluded: NDArray[np.bool_]
     pinhole: Pinhole
     T_rig_rect: Vector
     baseline_m: float

@@ -100,9 +100,7 @@ def _depth_error(subject: Subject, numbers: dict[str, Any]) -> Any:
     absolute, relative = figure.subplots(1, 2)
     import numpy as np
 
-    shown = sorted(
-        {subject.baselines_m[0], subject.baselines_m[len(subject.baselines_m) // 2], subject.baselines_m[-1]}
-    )
+    shown = sorted({subject.baselines_m[0], subject.baselines_m[len(subject.baselines_m) // 2], subject.baselines_m[-1]})
     for b in shown:
         z = np.geomspace(b * subject.f_px / subject.num_disparities, DEPTHS_M[-1], 100)
         error = z**2 * DISPARITY_ERROR_PX / (b * subject.f_px)

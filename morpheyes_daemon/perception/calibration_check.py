@@ -17,8 +17,8 @@ import numpy as np
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import BaselineEstimate, Image, StereoFrame
-from morpheyes_daemon.perception.camera_motion import EyeMotion
-from morpheyes_daemon.perception.yaw_estimator import STILL, Look, YawWatch
+from morpheyes_daemon.perception.camera_motion import CameraMotion
+from morpheyes_daemon.perception.yaw_estimator import STILL, Look, YawEstimator
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
 from morpheyes_daemon.stereo.epipolar import RowFit, RowWatch, row_offsets
 from morpheyes_daemon.stereo.rig import RigModel
@@ -102,7 +102,7 @@ class RigCheck:
     def __init__(self, rig: RigModel, size: tuple[int, int], limits: Limits | None = None) -> None:
         self._estimator = DepthEstimator(rig, size=size)
         self._limits = limits or Limits()
-        self._yaw = YawWatch(STILL)
+        self._yaw = YawEstimator(STILL)
         self._checks: dict[float, BaselineCheck] = {}
         self._time_ns = 0
 
@@ -121,7 +121,7 @@ class RigCheck:
             return here
         here.rows_px.append(offsets.median_px)
         here.fit = here.watch.add(offsets, depth.pinhole)
-        still = EyeMotion.still(depth.T_rig_rect)
+        still = CameraMotion.still(depth.T_rig_rect)
         seen = (disparity, depth.baseline_m, depth.baseline_sigma_m, depth.pinhole, still)
         self._yaw.add(Look(self._time_ns, pair.left, pair.right, *seen))
         self._time_ns += S // 100

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.messages.core import DepthMap, Image, Pinhole
-from morpheyes_daemon.perception.camera_motion import EyeMotion
+from morpheyes_daemon.perception.camera_motion import CameraMotion
 from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.transforms import Array, R_from_rotvec
 
@@ -58,10 +58,10 @@ class Sight:
 
     left: Image
     depth: DepthMap
-    motion: EyeMotion
+    motion: CameraMotion
 
 
-class ScaleWatch:
+class DepthScaleMonitor:
     """Fed with every frame; True once most of the latest telling frames agree that depth is out of scale."""
 
     def __init__(self, limits: ScaleLimits | None = None) -> None:
@@ -105,7 +105,7 @@ def scale_between(first: Sight, second: Sight) -> ScaleFit | None:
     return _fit(turned[good], flown, rays, second.depth.pinhole.f_px, _SPEED_SIGMA_M_S * seconds)
 
 
-def _flown(first: EyeMotion, second: EyeMotion, seconds: float) -> Array:
+def _flown(first: CameraMotion, second: CameraMotion, seconds: float) -> Array:
     """Return the way (3,) of the eye from frame to frame, in the second frame's axes."""
     v_ned = first.T_ned_rect[:3, :3] @ first.v_rect_m_s + second.T_ned_rect[:3, :3] @ second.v_rect_m_s
     return np.asarray(second.T_ned_rect[:3, :3].T @ v_ned * (seconds / 2.0))

@@ -16,8 +16,8 @@ from enum import StrEnum
 import numpy as np
 
 from morpheyes_daemon.messages.core import KNOWN_SHARE, BaselineEstimate, DepthMap
-from morpheyes_daemon.perception.camera_motion import EyeMotion, row_rates
-from morpheyes_daemon.perception.yaw_estimator import Look, Uncertain, YawWatch
+from morpheyes_daemon.perception.camera_motion import CameraMotion, row_rates
+from morpheyes_daemon.perception.yaw_estimator import Look, Uncertain, YawEstimator
 from morpheyes_daemon.stereo.depth import RectifiedPair, disparity_of
 from morpheyes_daemon.stereo.epipolar import SHARP_S, RowFit, RowOffsets, RowWatch, levelled
 from morpheyes_daemon.stereo.rectify import rectifying_rotation
@@ -31,7 +31,7 @@ _MEMORY = 0.95
 
 
 @dataclass(frozen=True, slots=True)
-class DriftLimits:
+class ExtrinsicsLimits:
     """What counts as drift, and what evidence it takes."""
 
     rows_px: float = 0.4
@@ -66,7 +66,7 @@ class DriftLimits:
     """A yaw is told from how disparities change with the baseline and on the way: not where much of the scene moves."""
 
 
-class Drift(StrEnum):
+class ExtrinsicsFault(StrEnum):
     """What a finding is about."""
 
     ROWS = "rows"
@@ -79,16 +79,16 @@ class Drift(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class DriftFinding:
+class ExtrinsicsFinding:
     """One thing noticed; `corrected` when the rig was turned for it."""
 
-    what: Drift
+    what: ExtrinsicsFault
     corrected: bool
     text: str
 
 
 @dataclass(frozen=True, slots=True)
-class DriftReport:
+class ExtrinsicsReport:
     """What one frame added. Angles are of the right eye, from where `rig` has it; sigmas inf when unknown.
 
     `rows_px` is the median row difference of this frame (NaN without points), `late_s` by how much the right eye
@@ -105,7 +105,7 @@ class DriftReport:
     yaw_sigma_rad: float
     late_s: float
     late_sigma_s: float
-    findings: tuple[DriftFinding, ...]
+    findings: tuple[ExtrinsicsFinding, ...]
 
     @property
     def rig_changed(self) -> bool:
@@ -113,25 +113,27 @@ class DriftReport:
         return any(finding.corrected for finding in self.findings)
 
 
-class DriftMonitor:
+class ExtrinsicsMonitor:
     """Fed with every depth map; `rig` is the calibration as corrected so far, to rectify the next frame by."""
 
-    def __init__(self, rig: RigModel, limits: DriftLimits | None = None, uncertain: Uncertain | None = None) -> None:
+    def __init__(
+        self, rig: RigModel, limits: ExtrinsicsLimits | None = None, uncertain: Uncertain | None = None
+    ) -> None:
         self.rig = rig
-        self.limits = limits or DriftLimits()
+        self.limits = limits or ExtrinsicsLimits()
         self._uncertain = uncertain
         self._turned: Array = np.eye(3)
-        self._told: set[Drift] = set()
+        self._told: set[ExtrinsicsFault] = set()
         self._fit: RowFit | None = None
         self._agreeing = self._late_frames = 0
         self._last_ns = 0
         self.broken = False
         """An eye has turned farther than any drift: depth is worth nothing until a new calibration."""
-        self._rows, self._yaw = RowWatch(_MEMORY, self.limits.late_s), YawWatch(uncertain)
+        self._rows, self._yaw = RowWatch(_MEMORY, self.limits.late_s), YawEstimator(uncertain)
 
     def update(
-        self, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, moving: bool, motion: EyeMotion
-    ) -> DriftReport:
+        self, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, moving: bool, motion: CameraMotion
+    ) -> ExtrinsicsReport:
         """Look at one pair rectified by `rig`, its depth map and row offsets, and the eye's motion.
 
         Nothing is corrected while the servo moves, and a frame whose baseline is hardly known does not count.
@@ -189,11 +191,11 @@ class DriftMonitor:
     def _forget(self) -> None:
         """Start collecting anew, since what was collected belongs to another rectification."""
         self._rows.forget_turn()
-        self._yaw = YawWatch(self._uncertain)
+        self._yaw = YawEstimator(self._uncertain)
         self._fit = None
         self._agreeing = 0
 
-    def _judge_rows(self, median_px: float, f_px: float, nominal_m: float) -> list[DriftFinding]:
+    def _judge_rows(self, median_px: float, f_px: float, nominal_m: float) -> list[ExtrinsicsFinding]:
         fit, limits = self._fit, self.limits
         assert fit is not None
         turn_px = f_px * np.abs([fit.pitch_rad, 0.4 * fit.roll_rad])
@@ -205,25 +207,29 @@ class DriftMonitor:
             return self._unexplained(fit, median_px)
         self._agreeing += 1
         if self._agreeing < (limits.frames if self._rows.sharp else limits.unsharp_frames):
-            return self._once(Drift.ROWS, f"rows differ by {median_px:.2f} px: watching whether an eye has turned")
+            return self._once(
+                ExtrinsicsFault.ROWS, f"rows differ by {median_px:.2f} px: watching whether an eye has turned"
+            )
         turn = np.array([fit.pitch_rad if sure[0] else 0.0, 0.0, fit.roll_rad if sure[1] else 0.0])
         text = f"the right eye has turned by {math.degrees(turn[0]):+.3f} deg in pitch and "
-        return self._turn(Drift.TURNED, turn, nominal_m, f"{text}{math.degrees(turn[2]):+.3f} deg in roll")
+        return self._turn(ExtrinsicsFault.TURNED, turn, nominal_m, f"{text}{math.degrees(turn[2]):+.3f} deg in roll")
 
-    def _unexplained(self, fit: RowFit, median_px: float) -> list[DriftFinding]:
+    def _unexplained(self, fit: RowFit, median_px: float) -> list[ExtrinsicsFinding]:
         """Rows that differ though no turn and no time offset explains it."""
         if fit.residual_px < 2 * self.limits.rows_px or fit.count < 5 * self.limits.points:
             return []
-        return self._once(Drift.UNEXPLAINED, f"rows differ by {median_px:.2f} px and no turn of an eye explains it")
+        return self._once(
+            ExtrinsicsFault.UNEXPLAINED, f"rows differ by {median_px:.2f} px and no turn of an eye explains it"
+        )
 
-    def _judge_yaw(self, f_px: float, nominal_m: float) -> list[DriftFinding]:
+    def _judge_yaw(self, f_px: float, nominal_m: float) -> list[ExtrinsicsFinding]:
         yaw, sigma, limits = self._yaw.yaw_rad, self._yaw.sigma_rad, self.limits
         sharp = sigma * f_px <= limits.yaw_sigma_px
         needed = limits.strong_sigmas * (0.5 if sharp else 1.0)
         if not abs(yaw) * f_px >= limits.yaw_px or abs(yaw) < needed * sigma:
             return []
         text = f"the right eye has turned by {math.degrees(yaw):+.3f} deg in yaw ({yaw * f_px:+.2f} px of disparity)"
-        return self._turn(Drift.YAW, np.array([0.0, yaw, 0.0]), nominal_m, text)
+        return self._turn(ExtrinsicsFault.YAW, np.array([0.0, yaw, 0.0]), nominal_m, text)
 
     def _late_off_s(self, fit: RowFit) -> float:
         return abs(abs(fit.late_s) - self.limits.late_s)
@@ -232,7 +238,7 @@ class DriftMonitor:
         least_s = max(self.limits.late_largest_s, self.limits.strong_sigmas * fit.late_sigma_s)
         return self._late_off_s(fit) > least_s
 
-    def _judge_late(self) -> list[DriftFinding]:
+    def _judge_late(self) -> list[ExtrinsicsFinding]:
         fit, limits = self._fit, self.limits
         if fit is None or fit.late_sigma_s > SHARP_S or self._agreeing:
             return []
@@ -240,32 +246,32 @@ class DriftMonitor:
         if off_s < limits.late_change_s + 3.0 * fit.late_sigma_s:
             return []
         text = f"the right eye exposes {fit.late_s * 1e3:.1f} ms late, not {limits.late_s * 1e3:.1f} ms as declared"
-        return self._once(Drift.LATE, text)
+        return self._once(ExtrinsicsFault.LATE, text)
 
-    def _turn(self, what: Drift, turn_rect_rad: Array, nominal_m: float, text: str) -> list[DriftFinding]:
+    def _turn(self, what: ExtrinsicsFault, turn_rect_rad: Array, nominal_m: float, text: str) -> list[ExtrinsicsFinding]:
         """Turn the rig's right eye, unless it has turned so far in all that it must be broken."""
         turned = turned_rig(self.rig, turn_rect_rad, nominal_m)
         total = turn_between(self.rig, nominal_m, R_from_rotvec(turn_rect_rad)) @ self._turned
         angle = math.acos(max(-1.0, min(1.0, (float(np.trace(total)) - 1.0) / 2.0)))
         if angle > self.limits.largest_rad:
-            if what is Drift.YAW and self._yaw.pairs < self.limits.yaw_pairs:
-                return self._once(Drift.DOUBTED, f"{text}: more than a drift, if it is confirmed")
+            if what is ExtrinsicsFault.YAW and self._yaw.pairs < self.limits.yaw_pairs:
+                return self._once(ExtrinsicsFault.DOUBTED, f"{text}: more than a drift, if it is confirmed")
             self._agreeing, self.broken = 0, True
-            return self._once(Drift.BROKEN, f"{text}: too far for a drift; land and calibrate again")
+            return self._once(ExtrinsicsFault.BROKEN, f"{text}: too far for a drift; land and calibrate again")
         self.rig, self._turned = turned, total
-        return [DriftFinding(what, True, f"{text}; corrected")]
+        return [ExtrinsicsFinding(what, True, f"{text}; corrected")]
 
-    def _once(self, what: Drift, text: str) -> list[DriftFinding]:
+    def _once(self, what: ExtrinsicsFault, text: str) -> list[ExtrinsicsFinding]:
         if what in self._told:
             return []
         self._told.add(what)
-        return [DriftFinding(what, False, text)]
+        return [ExtrinsicsFinding(what, False, text)]
 
     def _report(
-        self, rows_px: float, points: int, fit: RowFit | None, findings: tuple[DriftFinding, ...]
-    ) -> DriftReport:
+        self, rows_px: float, points: int, fit: RowFit | None, findings: tuple[ExtrinsicsFinding, ...]
+    ) -> ExtrinsicsReport:
         known = fit or RowFit(0.0, math.inf, 0.0, math.inf, 0.0, math.inf, math.nan, 0)
-        return DriftReport(
+        return ExtrinsicsReport(
             rows_px=rows_px,
             points=points,
             pitch_rad=known.pitch_rad,

@@ -80,7 +80,7 @@ class FrozenCheck:
         return last is not None and (_same(last[0], left) or _same(last[1], right))
 
 
-class AlikeCheck:
+class PairCheck:
     """Tells eyes that see different things, or the same at different times, or through another calibration.
 
     Of flights at 320x240 (forest, seeds 0 to 3) 0.44 to 0.89 of the textured places of the left are found again in

@@ -26,14 +26,14 @@ from morpheyes_daemon.messages.core import (
     frozen,
 )
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.perception.camera_motion import EyeMotion, eye_motion
+from morpheyes_daemon.perception.camera_motion import CameraMotion, camera_motion
 from morpheyes_daemon.perception.craft import build_craft, build_strategy
-from morpheyes_daemon.perception.depth_scale_monitor import ScaleWatch, Sight
-from morpheyes_daemon.perception.extrinsics_monitor import Drift, DriftLimits, DriftMonitor
+from morpheyes_daemon.perception.depth_scale_monitor import DepthScaleMonitor, Sight
+from morpheyes_daemon.perception.extrinsics_monitor import ExtrinsicsFault, ExtrinsicsLimits, ExtrinsicsMonitor
 from morpheyes_daemon.perception.image_checks import (
-    AlikeCheck,
     FrozenCheck,
     ImageFault,
+    PairCheck,
     exposure_faults,
     matching_faults,
 )
@@ -71,21 +71,15 @@ class PipelineFactory:
         return Pipeline(self.config, self.mission, read_calibration(self.calibration))
 
 
-
-
-
-
-
-
 class Pipeline:
     """The image side of the daemon for one mission and one rig."""
 
     def __init__(self, config: VehicleConfig, mission: MissionFile, rig: RigModel) -> None:
         self._estimator = DepthEstimator(rig, config.stereo, (config.camera.width_px, config.camera.height_px))
-        self._frozen, self._alike, self._scale = FrozenCheck(), AlikeCheck(), ScaleWatch()
+        self._frozen, self._alike, self._scale = FrozenCheck(), PairCheck(), DepthScaleMonitor()
         self._still_scene = mission.still_scene
-        limits = DriftLimits(late_s=config.camera.sync_error_ms / 1e3, watch_yaw=mission.still_scene)
-        self._drift = DriftMonitor(self._estimator.rig, limits)
+        limits = ExtrinsicsLimits(late_s=config.camera.sync_error_ms / 1e3, watch_yaw=mission.still_scene)
+        self._drift = ExtrinsicsMonitor(self._estimator.rig, limits)
         self._strategy = build_strategy(mission, config)
         self._T_frd_rig = build_craft(config).T_frd_rig
 
@@ -94,7 +88,7 @@ class Pipeline:
         started_s = stopwatch_s()
         pair = self._estimator.rectified(job.frame)
         depth = self._estimator.depth(job.frame, pair)
-        motion = eye_motion(job.vehicle, self._T_frd_rig, depth.T_rig_rect)
+        motion = camera_motion(job.vehicle, self._T_frd_rig, depth.T_rig_rect)
         offsets = row_offsets(pair.left, pair.right, disparity_of(depth))
         events = self._watch_calibration(job.frame, pair, depth, offsets, motion)
         faults = self._image_faults(job.frame, pair, depth, offsets, motion)
@@ -111,7 +105,7 @@ class Pipeline:
         )
 
     def _watch_calibration(
-        self, frame: StereoFrame, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, motion: EyeMotion
+        self, frame: StereoFrame, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, motion: CameraMotion
     ) -> tuple[Event, ...]:
         """Return what the drift watch noticed; the next frame is rectified by what it corrected."""
         seen = self._drift.update(pair, depth, offsets, frame.baseline.moving, motion)
@@ -121,14 +115,14 @@ class Pipeline:
             Event(
                 frame.t_ns,
                 "calibration",
-                Reason.EYES_LATE if finding.what is Drift.LATE else Reason.CALIBRATION_DRIFT,
+                Reason.EYES_LATE if finding.what is ExtrinsicsFault.LATE else Reason.CALIBRATION_DRIFT,
                 finding.text,
             )
             for finding in seen.findings
         )
 
     def _image_faults(
-        self, frame: StereoFrame, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, motion: EyeMotion
+        self, frame: StereoFrame, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, motion: CameraMotion
     ) -> tuple[Reason, ...]:
         """Return why the frame must not be flown on, empty when it may."""
         found = exposure_faults(pair.left, pair.right)

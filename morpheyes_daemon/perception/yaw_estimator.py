@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole
-from morpheyes_daemon.perception.camera_motion import EyeMotion, right_eye_rates
+from morpheyes_daemon.perception.camera_motion import CameraMotion, right_eye_rates
 from morpheyes_daemon.stereo.lucas_kanade import follow
 from morpheyes_daemon.transforms import Array, inverse
 
@@ -71,7 +71,7 @@ class Look:
     baseline_m: float
     baseline_sigma_m: float
     pinhole: Pinhole
-    motion: EyeMotion
+    motion: CameraMotion
     late_s: float = 0.0
     late_sigma_s: float = 0.0
 
@@ -92,7 +92,7 @@ class YawFit:
         return self.count >= _FEWEST_POINTS and self.share >= _STATIC_SHARE
 
 
-class YawWatch:
+class YawEstimator:
     """Compares each frame with the recent one that is farthest off in baseline; keeps the weighted mean of the yaw.
 
     Of all pairs within the same few seconds only the most telling counts, since they share their errors.

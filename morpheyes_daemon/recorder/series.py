@@ -16,7 +16,7 @@ from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import Event, Intent, Perception
 from morpheyes_daemon.messages.safety import State
-from morpheyes_daemon.safety.monitor import NOT_RESUMED
+from morpheyes_daemon.safety.monitor import REQUESTED_STOPS
 
 Column = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ class FlightSeries:
     def braking(self) -> list[tuple[float, str]]:
         """Return (second, reason) of each time the gate took the sticks back, the mission's end aside."""
         braked = self._beginnings("gate", lambda output: output.state == State.BRAKING)
-        return [(t, reason) for t, reason in braked if reason not in NOT_RESUMED]
+        return [(t, reason) for t, reason in braked if reason not in REQUESTED_STOPS]
 
     def stops(self) -> list[tuple[float, str]]:
         """Return (second, reason) of each time the mission itself stopped to look around."""

@@ -17,7 +17,7 @@ from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.calibration.targets.capture_guide import CaptureGuide, Hint
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import RawPair
-from morpheyes_daemon.rig_capture.rig_session import RigStand
+from morpheyes_daemon.rig_capture.rig_session import RigSession
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ Show = Callable[[Scene], None]
 
 
 async def capture_boards(
-    stand: RigStand, out: Path, board: Board, nominal_m: Sequence[float], wanted: int, show: Show
+    stand: RigSession, out: Path, board: Board, nominal_m: Sequence[float], wanted: int, show: Show
 ) -> dict[str, int]:
     """Fill `out` with `wanted` pairs for each nominal baseline; returns how many each folder holds.
 
@@ -48,7 +48,7 @@ async def capture_boards(
 
 
 async def capture_visits(
-    stand: RigStand, out: Path, board: Board, nominal_m: Sequence[float], visits: int, show: Show
+    stand: RigSession, out: Path, board: Board, nominal_m: Sequence[float], visits: int, show: Show
 ) -> dict[str, int]:
     """Go to every baseline `visits` times in turn and take one pair each time, the board standing still in view."""
     note_board(out, board)
@@ -76,9 +76,7 @@ def note_board(out: Path, board: Board) -> None:
     path.write_text(yaml.safe_dump({**known, **content}, sort_keys=False), encoding="utf-8")
 
 
-async def _one_baseline(
-    stand: RigStand, folder: Path, board: Board, nominal_m: float, wanted: int, show: Show
-) -> int:
+async def _one_baseline(stand: RigSession, folder: Path, board: Board, nominal_m: float, wanted: int, show: Show) -> int:
     number = _last_number(folder)
     if number >= wanted:
         return number
@@ -95,7 +93,7 @@ async def _one_baseline(
     return number
 
 
-async def _one_visit(stand: RigStand, folder: Path, board: Board, nominal_m: float, show: Show) -> int:
+async def _one_visit(stand: RigSession, folder: Path, board: Board, nominal_m: float, show: Show) -> int:
     await stand.place(nominal_m)
     number = _last_number(folder)
     while True:

@@ -21,12 +21,12 @@ from morpheyes_daemon.calibration.mount import ATTITUDES, COLUMNS, attitude_rows
 from morpheyes_daemon.calibration.targets.boards import Board, find_corners
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config.vehicle import VehicleConfig
-from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
 from morpheyes_daemon.messages.core import Image, VehicleState
 from morpheyes_daemon.rig_capture.board_capture import note_board, write_pair
-from morpheyes_daemon.rig_capture.rig_session import RigStand
+from morpheyes_daemon.rig_capture.rig_session import RigSession
 from morpheyes_daemon.transforms import Array, R_from_rpy, rotvec_from_R
 
 STILL_RAD_S = 0.03
@@ -44,7 +44,7 @@ class HandHeldVehicle:
     def __init__(self, config: VehicleConfig, clock: Clock, opener: LinkOpener) -> None:
         self._clock = clock
         self._topics = Topics.create()
-        self._hub = AutopilotHub(config.autopilot, clock, self._topics, EventLog(), opener)
+        self._hub = AutopilotConnection(config.autopilot, clock, self._topics, EventLog(), opener)
 
     async def __aenter__(self) -> Self:
         self._task = asyncio.create_task(self._hub.run(), name="autopilot")
@@ -68,7 +68,7 @@ class HandHeldVehicle:
 
 
 async def capture_mount(
-    stand: RigStand, vehicle: Callable[[], VehicleState], clock: Clock, out: Path, board: Board, wanted: int, say: Say
+    stand: RigSession, vehicle: Callable[[], VehicleState], clock: Clock, out: Path, board: Board, wanted: int, say: Say
 ) -> int:
     """Fill `out` with `wanted` pictures and attitudes, eyes at their smallest baseline; returns how many it holds.
 

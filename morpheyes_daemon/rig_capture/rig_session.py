@@ -19,7 +19,7 @@ from morpheyes_daemon.devices.servo import Servo, build_servo
 from morpheyes_daemon.messages.core import RawPair
 
 
-class RigStand:
+class RigSession:
     """An open camera and servo; use it with `async with`."""
 
     def __init__(self, camera: Camera, servo: Servo, config: VehicleConfig, clock: Clock) -> None:

@@ -33,11 +33,6 @@ NARROWEST_US, WIDEST_US = 800, 2200
 """What RCn_MIN and RCn_MAX may be; 0, 65534 and 65535 mean other things than a width."""
 
 
-
-
-
-
-
 @dataclass(frozen=True, slots=True)
 class StickLimits:
     """Bounds of the four sticks in microseconds, from the autopilot's own RCn parameters.
@@ -60,8 +55,6 @@ class StickLimits:
                 )
         if not 0.0 < self.slew_us_s < math.inf:
             raise DeviceError(f"The sticks' rate limit is {self.slew_us_s} us/s: it must be positive and finite.")
-
-
 
 
 class Gate:

@@ -1,4 +1,4 @@
-"""The guardian turns what is heard into triggers of the state machine and steps the gate.
+"""The monitor turns what is heard into triggers of the state machine and steps the gate.
 
 Edges that hand the sticks back (switch off, mode change, disarm) act on reception, inside `on_vehicle`, before it
 returns. Everything else is judged at each stick period in `step`. Pure: time comes in as an argument.
@@ -19,7 +19,7 @@ from morpheyes_daemon.safety.engage_switch import EngageSwitch
 from morpheyes_daemon.safety.gate import Gate
 from morpheyes_daemon.safety.leases import LEASE_REASONS, Lease
 from morpheyes_daemon.safety.states import HOLDING, Machine, Transition, Trigger
-from morpheyes_daemon.safety.vehicle_health import concern
+from morpheyes_daemon.safety.vehicle_health import vehicle_fault
 
 LOITER = 5
 """ArduCopter's custom_mode of Loiter (ArduCopter mode.h)."""
@@ -44,15 +44,15 @@ RESUMED = frozenset(
 )
 """Braking for these, and only these, may end in flying on; while the pilot was not heard he may have taken over."""
 
-DEAF = frozenset({Reason.LINK_LOST, Reason.RC_LOST})
+PILOT_UNHEARD = frozenset({Reason.LINK_LOST, Reason.RC_LOST})
 """While these last the pilot cannot be heard taking the sticks back."""
 
-NOT_RESUMED = (Reason.GOAL_REACHED, Reason.MISSION_REFUSED, Reason.SHUTDOWN)
+REQUESTED_STOPS = (Reason.GOAL_REACHED, Reason.MISSION_REFUSED, Reason.SHUTDOWN)
 """Stops that somebody asked for, as against braking for want of something."""
 
 
 @dataclass(frozen=True, slots=True)
-class GuardianLimits:
+class SafetyMonitorLimits:
     """Ages in seconds; see SafetyConfig and AutopilotConfig.
 
     `battery_low` is a fraction of the charge; `gcs_timeout_s` None does not watch the ground station.
@@ -69,7 +69,7 @@ class GuardianLimits:
     gcs_timeout_s: float | None = None
 
     @classmethod
-    def of(cls, config: VehicleConfig) -> GuardianLimits:
+    def of(cls, config: VehicleConfig) -> SafetyMonitorLimits:
         """Read the limits from the vehicle's configuration."""
         safety, autopilot = config.safety, config.autopilot
         return cls(
@@ -84,14 +84,14 @@ class GuardianLimits:
         )
 
 
-class Guardian:
+class SafetyMonitor:
     """Machine, gate and what was last heard of the pilot, kept together.
 
     `on_transition` is called for every step of the machine, after the gate has acted on it.
     """
 
     def __init__(
-        self, gate: Gate, limits: GuardianLimits, on_transition: Callable[[Transition], None] = lambda step: None
+        self, gate: Gate, limits: SafetyMonitorLimits, on_transition: Callable[[Transition], None] = lambda step: None
     ) -> None:
         self.gate = gate
         self.machine = Machine()
@@ -134,7 +134,7 @@ class Guardian:
     def on_vehicle(self, vehicle: VehicleState, now_ns: int) -> None:
         """Take a fresh vehicle state; the pilot's edges are acted on before this returns."""
         self._vehicle = vehicle
-        self._hear_switch(vehicle, now_ns)
+        self._update_switch(vehicle, now_ns)
         self._renew_vehicle(vehicle)
         if not vehicle.heartbeat_t_ns:
             return
@@ -199,12 +199,12 @@ class Guardian:
         return self.gate.release(self.state, reason, now_ns)
 
     def step(self, now_ns: int) -> GateOutput:
-        """Judge ages and readiness, then let the gate send; called at the stick rate."""
+        """Referee ages and readiness, then let the gate send; called at the stick rate."""
         self._watch_clock(now_ns)
         if self.state in HOLDING:
-            self._judge_flight(now_ns)
+            self._check_flight(now_ns)
         else:
-            self._judge_ground(now_ns)
+            self._check_ground(now_ns)
         out = self.gate.step(self.state, self.reason, now_ns)
         if out.action is Action.STICKS:
             self._flown_ns = now_ns
@@ -218,7 +218,7 @@ class Guardian:
         if oldest and math.isfinite(sum((*angles, *vehicle.p_ned_m, *vehicle.v_ned_m_s))):
             self.gate.renew(Lease.VEHICLE, oldest + round(self._limits.vehicle_timeout_s * S))
 
-    def _hear_switch(self, vehicle: VehicleState, now_ns: int) -> None:
+    def _update_switch(self, vehicle: VehicleState, now_ns: int) -> None:
         index = self._limits.engage_channel - 1
         if not vehicle.rc_t_ns or index >= len(vehicle.rc_us):
             return
@@ -238,9 +238,9 @@ class Guardian:
             return
         if now_ns < before_ns:
             self._distrust_stamps(now_ns)
-            self._worry(Reason.CLOCK_STEPPED, now_ns)
+            self._brake_for(Reason.CLOCK_STEPPED, now_ns)
         elif now_ns - before_ns > PAUSE_S * S:
-            self._worry(Reason.LOOP_LATE, now_ns)
+            self._brake_for(Reason.LOOP_LATE, now_ns)
 
     def _distrust_stamps(self, now_ns: int) -> None:
         for lease in Lease:
@@ -251,7 +251,7 @@ class Guardian:
 
     # -- outside flight -----------------------------------------------------------------------------------------
 
-    def _judge_ground(self, now_ns: int) -> None:
+    def _check_ground(self, now_ns: int) -> None:
         if self._leaving:
             return
         missing = self._missing_on_ground(now_ns)
@@ -271,7 +271,7 @@ class Guardian:
         lease = self.gate.stale(now_ns)
         if lease is not None:
             return LEASE_REASONS[lease]
-        worry = self._concern(now_ns)
+        worry = self._vehicle_fault(now_ns)
         if worry is not None:
             return worry
         if self._switch.on and not self._switch.flipped(now_ns):
@@ -299,24 +299,24 @@ class Guardian:
 
     # -- in flight ----------------------------------------------------------------------------------------------
 
-    def _judge_flight(self, now_ns: int) -> None:
+    def _check_flight(self, now_ns: int) -> None:
         lease = self.gate.stale(now_ns)
         stale = LEASE_REASONS[lease] if lease is not None else None
-        worry = self._concern(now_ns) or self._idleness(now_ns)
+        worry = self._vehicle_fault(now_ns) or self._idle_reason(now_ns)
         if worry is not None:
-            self._worry(worry, now_ns)
+            self._brake_for(worry, now_ns)
         if stale is not None and not self._latched:
-            self._judge_lease(stale, now_ns)
-        self._judge_deafness(next((reason for reason in (stale, worry) if reason in DEAF), None), now_ns)
+            self._check_lease(stale, now_ns)
+        self._check_pilot_link(next((reason for reason in (stale, worry) if reason in PILOT_UNHEARD), None), now_ns)
         if self.state is State.BRAKING:
-            self._judge_braking(lease, now_ns)
+            self._check_braking(lease, now_ns)
 
-    def _judge_lease(self, reason: Reason, now_ns: int) -> None:
+    def _check_lease(self, reason: Reason, now_ns: int) -> None:
         """The first reason for braking stays, unless a later one forbids to fly on."""
         if self.state is State.ENGAGED or reason not in RESUMED:
             self._fire(Trigger.STALE, reason, now_ns)
 
-    def _judge_braking(self, lease: Lease | None, now_ns: int) -> None:
+    def _check_braking(self, lease: Lease | None, now_ns: int) -> None:
         held_s = (now_ns - self.machine.since_ns) / S
         neutral_s, resume_s = self._limits.neutral_before_release_s, self._limits.resume_within_s
         if self._leaving:
@@ -328,7 +328,7 @@ class Guardian:
         elif self._at_rest(now_ns) or held_s >= 2.0 * neutral_s:
             self._fire(Trigger.STOPPED, self.reason, now_ns)
 
-    def _judge_deafness(self, deaf: Reason | None, now_ns: int) -> None:
+    def _check_pilot_link(self, deaf: Reason | None, now_ns: int) -> None:
         """Sticks are held only while the pilot can be heard taking them back."""
         if deaf is None:
             self._deaf_since_ns = None
@@ -342,17 +342,17 @@ class Guardian:
         known = self.gate.is_fresh(Lease.VEHICLE, now_ns)
         return known and math.hypot(*self._vehicle.v_ned_m_s) < AT_REST_M_S
 
-    def _concern(self, now_ns: int) -> Reason | None:
-        return concern(self._vehicle, now_ns, self._limits.battery_low, self._limits.gcs_timeout_s)
+    def _vehicle_fault(self, now_ns: int) -> Reason | None:
+        return vehicle_fault(self._vehicle, now_ns, self._limits.battery_low, self._limits.gcs_timeout_s)
 
-    def _idleness(self, now_ns: int) -> Reason | None:
+    def _idle_reason(self, now_ns: int) -> Reason | None:
         idle_ns = now_ns - max(self._flown_ns, self.machine.since_ns)
         idle = self.state is State.ENGAGED and idle_ns > IDLE_S * S
         return Reason.COMMAND_INVALID if idle else None
 
     # -- acting -------------------------------------------------------------------------------------------------
 
-    def _worry(self, reason: Reason, now_ns: int) -> None:
+    def _brake_for(self, reason: Reason, now_ns: int) -> None:
         """Brake for what is no failed part of ours; said once, since it may last."""
         if self.state in HOLDING and not self._latched:
             self._fire(Trigger.FAULT, reason, now_ns)

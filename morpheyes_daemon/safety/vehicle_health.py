@@ -1,6 +1,6 @@
-"""What the autopilot reports about itself that forbids flying on: one row per concern, worst first.
+"""What the autopilot reports about itself that forbids flying on: one row per vehicle_fault, worst first.
 
-On the ground a concern keeps the daemon from being ready; in flight it brakes and waits for the pilot. What the
+On the ground a vehicle_fault keeps the daemon from being ready; in flight it brakes and waits for the pilot. What the
 autopilot itself does about it (RTL, LAND) comes as a mode change, which releases.
 """
 
@@ -44,10 +44,10 @@ def aided(vehicle: VehicleState) -> bool:
     return not fitted or bool(delivering)
 
 
-def concern(vehicle: VehicleState, now_ns: int, battery_low: float, gcs_timeout_s: float | None) -> Reason | None:
-    """Return the worst concern, None when there is none.
+def vehicle_fault(vehicle: VehicleState, now_ns: int, battery_low: float, gcs_timeout_s: float | None) -> Reason | None:
+    """Return the worst vehicle_fault, None when there is none.
 
-    `battery_low` is a fraction of the charge; a battery that nobody measures (NaN) is no concern.
+    `battery_low` is a fraction of the charge; a battery that nobody measures (NaN) is no vehicle_fault.
     `gcs_timeout_s` None does not watch the ground station.
     """
     rows = (

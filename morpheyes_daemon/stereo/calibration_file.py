@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from morpheyes_daemon.config.yaml_errors import parse_yaml, read_text, validate
 from morpheyes_daemon.errors import CalibrationError, ConfigError
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
-from morpheyes_daemon.stereo.rig import CalibratedBaseline, EyeMount, RigModel
+from morpheyes_daemon.stereo.rig import CalibratedBaseline, CameraMount, RigModel
 
 FORMAT = "morpheyes-calibration-1"
 
@@ -162,8 +162,8 @@ def _rig(file: _File) -> RigModel:
     )
 
 
-def _eye_mount(part: _Mount) -> EyeMount:
-    return EyeMount(_radians(part.rotation_deg), _radians(part.sigma_deg))
+def _eye_mount(part: _Mount) -> CameraMount:
+    return CameraMount(_radians(part.rotation_deg), _radians(part.sigma_deg))
 
 
 def _intrinsics(part: _Camera) -> CameraIntrinsics:
@@ -211,7 +211,7 @@ def _baseline_part(baseline: CalibratedBaseline) -> dict[str, Any]:
     return {key: value for key, value in part.items() if value is not None}
 
 
-def _mount_part(mount: EyeMount) -> dict[str, Any]:
+def _mount_part(mount: CameraMount) -> dict[str, Any]:
     return {
         "rotation_deg": [_digits(math.degrees(angle)) for angle in mount.rotation_rad],
         "sigma_deg": [_digits(math.degrees(angle)) for angle in mount.sigma_rad],

@@ -108,7 +108,7 @@ class DepthEstimator:
             t_ns=frame.t_ns,
             depth_m=frozen(depth_m),
             near=frozen(found.near),
-            one_eyed=frozen(found.one_eyed),
+            half_occluded=frozen(found.half_occluded),
             pinhole=rectified.pinhole,
             T_rig_rect=rectified.T_rig_rect,
             baseline_m=baseline_m,

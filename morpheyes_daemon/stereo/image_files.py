@@ -48,9 +48,7 @@ def write_depth(out: Path, depth: StillDepth, title: str) -> list[Path]:
         np.save(out / "depth.npy", depth.depth_m)
         draw_depth(out / "depth.png", depth, title)
     except OSError as error:
-        raise InputError(
-            f"{out}: the results cannot be written there ({error.strerror}); name another --out."
-        ) from None
+        raise InputError(f"{out}: the results cannot be written there ({error.strerror}); name another --out.") from None
     return [out / "depth.npy", out / "depth.png"]
 
 
@@ -72,9 +70,9 @@ def draw_depth(path: Path, depth: StillDepth, title: str) -> None:
         axes.set_title(name, fontsize=9, color=INK, loc="left")
     _colour_bar(figure, panels[1], near_m, far_m)
     shares = [
-        (UNKNOWN_BGR, "unknown", np.isnan(depth.depth_m) & ~depth.near & ~depth.one_eyed),
+        (UNKNOWN_BGR, "unknown", np.isnan(depth.depth_m) & ~depth.near & ~depth.half_occluded),
         (NEAR_BGR, f"nearer than {depth.near_limit_m:.2f} m", depth.near),
-        (ONE_EYED_BGR, "only the left eye sees it", depth.one_eyed),
+        (ONE_EYED_BGR, "only the left eye sees it", depth.half_occluded),
     ]
     handles = [
         Patch(facecolor=_hex(bgr), edgecolor=GREY, label=f"{label} ({100 * mask.mean():.1f} %)")
@@ -96,7 +94,7 @@ def _range(depth_m: FloatMap) -> tuple[float, float]:
 def _coloured(depth: StillDepth, near_m: float, far_m: float) -> Image:
     picture = colour_depth(depth.depth_m, near_m, far_m)
     picture[depth.near] = NEAR_BGR
-    picture[depth.one_eyed] = ONE_EYED_BGR
+    picture[depth.half_occluded] = ONE_EYED_BGR
     return picture
 
 
@@ -107,9 +105,7 @@ def _colour_bar(figure: Any, axes: Any, near_m: float, far_m: float) -> None:
 
     ramp = np.geomspace(near_m, far_m, 256).astype(np.float32)[None]
     colours = ListedColormap(_rgb(colour_depth(ramp, near_m, far_m))[0] / 255.0)
-    bar = figure.colorbar(
-        ScalarMappable(LogNorm(near_m, far_m), colours), cax=axes.inset_axes((1.03, 0.0, 0.045, 1.0))
-    )
+    bar = figure.colorbar(ScalarMappable(LogNorm(near_m, far_m), colours), cax=axes.inset_axes((1.03, 0.0, 0.045, 1.0)))
     bar.ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
     bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
     bar.ax.yaxis.set_minor_formatter(NullFormatter())

@@ -72,12 +72,12 @@ class MatchSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """disparity_px (H, W) float32, NaN unknown; near: unknown because nearer than `ceiling_px`; one_eyed: unknown
+    """disparity_px (H, W) float32, NaN unknown; near: unknown because nearer than `ceiling_px`; half_occluded: unknown
     because only the left eye sees it."""
 
     disparity_px: FloatMap
     near: Mask
-    one_eyed: Mask
+    half_occluded: Mask
     ceiling_px: float
 
 
@@ -116,10 +116,10 @@ def match(
     left_seen, right_seen = (_rows_of(seen, step) for seen in (left_seen, right_seen))
     _forget_unseen(disparity, near, left_seen, right_seen)
     _forget_islands(disparity, round(left.size * settings.island_per_image), settings.island_shore)
-    one_eyed = _one_eyed(disparity, near, ceiling)
+    half_occluded = _half_occluded(disparity, near, ceiling)
     if step > 1:
-        disparity, near, one_eyed = (_grown(array, 1, step, shape) for array in (disparity, near, one_eyed))
-    return Match(disparity, near, one_eyed, float(ceiling))
+        disparity, near, half_occluded = (_grown(array, 1, step, shape) for array in (disparity, near, half_occluded))
+    return Match(disparity, near, half_occluded, float(ceiling))
 
 
 def semi_global(left: Image, right: Image, low: int, count: int, settings: MatchSettings, speckle_px: int) -> FloatMap:
@@ -221,7 +221,7 @@ def _neighbours(labels: NDArray[Any], unknown: Mask) -> Iterator[tuple[NDArray[A
     yield labels[1:], labels[:-1], unknown[:-1]
 
 
-def _one_eyed(disparity: FloatMap, near: Mask, ceiling: float) -> Mask:
+def _half_occluded(disparity: FloatMap, near: Mask, ceiling: float) -> Mask:
     """Return where something nearer hides an unknown pixel from the right eye, or the image's edge does.
 
     Seen from the right eye a nearer surface with disparity d_f covers d_f - d_b pixels of the background (d_b) left

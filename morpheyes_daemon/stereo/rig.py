@@ -22,7 +22,7 @@ from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.screw import dual_quaternion, pose_from_dual_quaternion, sclerp
 from morpheyes_daemon.transforms import Array, R_from_rotvec, q_from_R
 
-__all__ = ["CalibratedBaseline", "CameraIntrinsics", "EyeMount", "RigModel"]
+__all__ = ["CalibratedBaseline", "CameraIntrinsics", "CameraMount", "RigModel"]
 
 RANGE_TOLERANCE_M = 1.5e-3
 """How far outside the calibrated range a baseline is still served: two servos' backlash and the play at the stops."""
@@ -59,7 +59,7 @@ class CalibratedBaseline:
 
 
 @dataclass(frozen=True)
-class EyeMount:
+class CameraMount:
     """How the left eye is turned on the bar: rotation vector R_rig_cam0 and one sigma of it, radians, camera axes."""
 
     rotation_rad: tuple[float, float, float]
@@ -80,7 +80,7 @@ class RigModel:
     baselines: tuple[CalibratedBaseline, ...]
     method: str = "solved"
     details: Mapping[str, Any] = field(default_factory=dict)
-    mount: EyeMount | None = None
+    mount: CameraMount | None = None
 
     def __post_init__(self) -> None:
         nominal = [baseline.nominal_m for baseline in self.baselines]

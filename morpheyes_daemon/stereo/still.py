@@ -28,7 +28,7 @@ class StillDepth:
     left: Image
     depth_m: FloatMap
     near: NDArray[np.bool_]
-    one_eyed: NDArray[np.bool_]
+    half_occluded: NDArray[np.bool_]
     near_limit_m: float
     baseline_m: float
     f_px: float
@@ -75,7 +75,7 @@ def rectified_depth(
     found = match(grey(left), grey(right), count, MatchSettings(), min_disparity=low)
     depth_m = depth_from_disparity(found.disparity_px, baseline_m, f_px, doffs_px)
     limit = near_limit_m(baseline_m, f_px, found.ceiling_px, doffs_px)
-    return StillDepth(left, depth_m, found.near, found.one_eyed, limit, baseline_m, f_px)
+    return StillDepth(left, depth_m, found.near, found.half_occluded, limit, baseline_m, f_px)
 
 
 def raw_depth(
@@ -101,7 +101,7 @@ def raw_depth(
     depth = estimator.depth(frame, pair, near_m)
     shown = pair.rectification.cam0.image(left)
     limit, f_px = depth.near_limit_m, depth.pinhole.f_px
-    return StillDepth(shown, depth.depth_m, depth.near, depth.one_eyed, limit, depth.baseline_m, f_px)
+    return StillDepth(shown, depth.depth_m, depth.near, depth.half_occluded, limit, depth.baseline_m, f_px)
 
 
 def halves(picture: Image) -> tuple[Image, Image]:

@@ -60,8 +60,6 @@ class View:
         return T @ self.T_frd_rig @ self.depth.T_rig_rect
 
 
-
-
 class Strategy(ABC):
     """A mission. Subclasses set `Parameters` and are found by name through the entry points."""
 

@@ -1,7 +1,7 @@
-"""The supervisor owns every task: starts them, restarts what dies with back-off, and says so to the guardian.
+"""The supervisor owns every task: starts them, restarts what dies with back-off, and says so to the monitor.
 
 It also renews the gate's SUPERVISOR lease, so that a supervisor that no longer runs means neutral sticks. A part
-that has never worked yet is missing; one that worked and died is a fault. Flight is judged by the guardian.
+that has never worked yet is missing; one that worked and died is a fault. Flight is judged by the monitor.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from morpheyes_daemon.errors import MorphEyesError, mistake
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.safety.leases import Lease
-from morpheyes_daemon.safety.monitor import Guardian
+from morpheyes_daemon.safety.monitor import SafetyMonitor
 
 RATE_HZ = 20.0
 FIRST_BACKOFF_S = 0.5
@@ -57,11 +57,11 @@ class Supervisor:
     """Runs a table of tasks until cancelled."""
 
     def __init__(
-        self, tasks: list[Task], guardian: Guardian, events: EventLog, clock: Clock, lease_s: float
+        self, tasks: list[Task], monitor: SafetyMonitor, events: EventLog, clock: Clock, lease_s: float
     ) -> None:
         self.tasks = tasks
         self.pulses = {task.name: Pulse(clock) for task in tasks}
-        self._guardian = guardian
+        self._guardian = monitor
         self._events = events
         self._clock = clock
         self._lease_ns = round(lease_s * S)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from morpheyes_daemon.clock import Clock, Ticker
-from morpheyes_daemon.safety.monitor import Guardian
+from morpheyes_daemon.safety.monitor import SafetyMonitor
 from morpheyes_daemon.safety.states import HOLDING
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
@@ -31,7 +31,7 @@ class AuxOutput(Protocol):
         """Switch a function of the autopilot; raises DeviceError."""
 
 
-async def avoidance(output: AuxOutput, guardian: Guardian, clock: Clock, pulse: Pulse) -> None:
+async def avoidance(output: AuxOutput, monitor: SafetyMonitor, clock: Clock, pulse: Pulse) -> None:
     """Keep the avoidance off while we hold the sticks, and on otherwise; raises the output's DeviceError.
 
     What it was before nobody knows, so it is said once at the start, too: after a death in flight it may be off.
@@ -39,7 +39,7 @@ async def avoidance(output: AuxOutput, guardian: Guardian, clock: Clock, pulse: 
     ticker = Ticker(clock, RATE_HZ)
     said: int | None = None
     while True:
-        wanted = OFF if guardian.state in HOLDING else ON
+        wanted = OFF if monitor.state in HOLDING else ON
         if output.up and wanted != said:
             await output.set_aux_function(AVOID_PROXIMITY, wanted)
             said = wanted

@@ -32,5 +32,3 @@ async def capture(
             pulse.beat()
     finally:
         await camera.close()
-
-

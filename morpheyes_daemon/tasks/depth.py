@@ -7,7 +7,7 @@ from typing import Protocol
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, S
-from morpheyes_daemon.control.pose_history import VehicleTrack
+from morpheyes_daemon.control.pose_history import PoseHistory
 from morpheyes_daemon.messages.core import Event, Perception
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.perception.pipeline import VisionJob
@@ -15,7 +15,7 @@ from morpheyes_daemon.safety.gate import Gate
 from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
-WORTHLESS = frozenset({Reason.IMAGE_BAD, Reason.EYES_APART, Reason.DEPTH_SCALE})
+UNUSABLE_IMAGES = frozenset({Reason.IMAGE_BAD, Reason.EYES_APART, Reason.DEPTH_SCALE})
 """Depth from images with these faults is not flown on."""
 
 
@@ -28,7 +28,7 @@ class Worker(Protocol):
 
 async def depth(
     worker: Worker,
-    track: VehicleTrack,
+    track: PoseHistory,
     topics: Topics,
     events: EventLog,
     gate: Gate,
@@ -55,7 +55,7 @@ async def depth(
         faults = seen.image_faults
         for event in seen.events:
             events.publish(event)
-        if not WORTHLESS & set(faults):
+        if not UNUSABLE_IMAGES & set(faults):
             gate.renew(Lease.DEPTH, frame.t_ns + lease_ns)
         topics.perception.publish(seen)
         pulse.beat()

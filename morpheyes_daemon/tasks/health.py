@@ -9,7 +9,7 @@ from dataclasses import fields
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import MS, Clock, S, Ticker
 from morpheyes_daemon.messages.safety import Health
-from morpheyes_daemon.safety.monitor import Guardian
+from morpheyes_daemon.safety.monitor import SafetyMonitor
 from morpheyes_daemon.supervisor.supervisor import Pulse, Supervisor
 
 REPORT_HZ = 4.0
@@ -18,11 +18,9 @@ LISTEN_HZ = 40.0
 """How often the loop is listened to; a hold-up shorter than its period may be missed."""
 
 
-
-
 async def health(
     supervisor: Supervisor,
-    guardian: Guardian,
+    monitor: SafetyMonitor,
     topics: Topics,
     clock: Clock,
     tell: Callable[[Health], None],
@@ -43,9 +41,9 @@ async def health(
         before_ns = now_ns
         report = Health(
             t_ns=now_ns,
-            state=guardian.state,
-            reason=guardian.reason,
-            missing=guardian.missing,
+            state=monitor.state,
+            reason=monitor.reason,
+            missing=monitor.missing,
             ages_s={name: _age_s(getattr(topics, name).get(), now_ns) for name in counts},
             rates_hz=rates,
             restarts={task.name: task.restarts for task in supervisor.tasks},
@@ -61,5 +59,3 @@ def _age_s(value: object, now_ns: int) -> float:
     """Age of a message by its own stamp; NaN before the first."""
     stamp = getattr(value, "t_ns", None) or getattr(getattr(value, "summary", None), "t_ns", None)
     return (now_ns - stamp) / S if stamp else math.nan
-
-

@@ -8,13 +8,13 @@ from typing import Protocol
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.control.governor import Stopping
-from morpheyes_daemon.control.pose_history import VehicleTrack
+from morpheyes_daemon.control.pose_history import PoseHistory
 from morpheyes_daemon.messages.core import Intent, Perception
 from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.leases import Lease
-from morpheyes_daemon.safety.monitor import Guardian
+from morpheyes_daemon.safety.monitor import SafetyMonitor
 from morpheyes_daemon.strategies.base import Strategy
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
@@ -28,7 +28,7 @@ class StoppingSource(Protocol):
 
 
 def observe(
-    seen: Perception, track: VehicleTrack, vehicle: StoppingSource, guardian: Guardian, now_ns: int, reaction_s: float
+    seen: Perception, track: PoseHistory, vehicle: StoppingSource, monitor: SafetyMonitor, now_ns: int, reaction_s: float
 ) -> Observation:
     """Put together what the strategy gets."""
     present = track.now(now_ns)
@@ -44,15 +44,15 @@ def observe(
         baseline_m=seen.summary.baseline_m,
         braking_m=stopping.stopping_distance_m(speed, height_m) if stopping else math.inf,
         reserve_m=stopping.stopping_distance_m(speed, height_m, reaction_s) if stopping else math.inf,
-        engaged=guardian.state in (State.ENGAGED, State.BRAKING),
+        engaged=monitor.state in (State.ENGAGED, State.BRAKING),
     )
 
 
 async def mission(
     strategy: Strategy,
-    track: VehicleTrack,
+    track: PoseHistory,
     vehicle: StoppingSource,
-    guardian: Guardian,
+    monitor: SafetyMonitor,
     topics: Topics,
     clock: Clock,
     reaction_s: float,
@@ -69,14 +69,14 @@ async def mission(
         await percepts.next()
         await topics.gate.reader().next()
         seen = percepts.newest()
-        observation = observe(seen, track, vehicle, guardian, clock.now_ns(), reaction_s)
+        observation = observe(seen, track, vehicle, monitor, clock.now_ns(), reaction_s)
         topics.observation.publish(observation)
         followed = strategy.track(seen.percept)
         if followed is not None:
             topics.track.publish(followed)
         command = strategy.decide(observation)
         topics.command.publish(command)
-        guardian.gate.renew(Lease.MISSION, min(command.expires_ns, observation.now_ns + round(longest_s * S)))
+        monitor.gate.renew(Lease.MISSION, min(command.expires_ns, observation.now_ns + round(longest_s * S)))
         if command.intent in (Intent.DONE, Intent.REFUSE):
-            guardian.mission_over(command.reason or Reason.GOAL_REACHED, clock.now_ns())
+            monitor.mission_over(command.reason or Reason.GOAL_REACHED, clock.now_ns())
         pulse.beat()

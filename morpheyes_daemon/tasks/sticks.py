@@ -6,13 +6,13 @@ from typing import Protocol
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import MS, Clock, Ticker
-from morpheyes_daemon.control.pose_history import VehicleTrack
-from morpheyes_daemon.control.stick_controller import FlightControl
+from morpheyes_daemon.control.pose_history import PoseHistory
+from morpheyes_daemon.control.stick_controller import StickController
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.leases import Lease
-from morpheyes_daemon.safety.monitor import Guardian
+from morpheyes_daemon.safety.monitor import SafetyMonitor
 from morpheyes_daemon.supervisor.supervisor import Pulse
 
 LATE_NS = 100 * MS
@@ -23,14 +23,14 @@ class ControlSource(Protocol):
     """Has the flight control once the autopilot's parameters are known."""
 
     @property
-    def control(self) -> FlightControl | None:
+    def control(self) -> StickController | None:
         """The flight control, None before the parameters are known."""
 
 
 async def sticks(
     source: ControlSource,
-    track: VehicleTrack,
-    guardian: Guardian,
+    track: PoseHistory,
+    monitor: SafetyMonitor,
     topics: Topics,
     events: EventLog,
     clock: Clock,
@@ -43,24 +43,24 @@ async def sticks(
         late_ns = await ticker.wait()
         now_ns = clock.now_ns()
         if late_ns > LATE_NS:
-            guardian.gate.revoke(Lease.SUPERVISOR)
+            monitor.gate.revoke(Lease.SUPERVISOR)
             events.publish(Event(now_ns, "sticks", Reason.LOOP_LATE, f"held up for {late_ns / MS:.0f} ms"))
         else:
-            _offer(source.control, track, guardian, topics, now_ns)
-        topics.gate.publish(guardian.step(now_ns))
+            _offer(source.control, track, monitor, topics, now_ns)
+        topics.gate.publish(monitor.step(now_ns))
         pulse.beat()
 
 
 def _offer(
-    control: FlightControl | None, track: VehicleTrack, guardian: Guardian, topics: Topics, now_ns: int
+    control: StickController | None, track: PoseHistory, monitor: SafetyMonitor, topics: Topics, now_ns: int
 ) -> None:
     command, seen = topics.command.get(), topics.perception.get()
     if control is None or command is None or seen is None:
         return
-    if guardian.state is not State.ENGAGED:
+    if monitor.state is not State.ENGAGED:
         control.reset()
         return
     wanted, governed = control.step(command, seen.summary, track.now(now_ns), now_ns)
     topics.governed.publish(governed)
     topics.sticks.publish(wanted)
-    guardian.gate.offer(wanted)
+    monitor.gate.offer(wanted)

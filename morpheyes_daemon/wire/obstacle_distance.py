@@ -20,9 +20,7 @@ _UNKNOWN_SENSOR = 4
 _BODY_FRD = 12
 
 
-def obstacle_distance_message(
-    sectors_m: NDArray[np.float32], h_fov_rad: float, max_m: float, now_ns: int
-) -> Message:
+def obstacle_distance_message(sectors_m: NDArray[np.float32], h_fov_rad: float, max_m: float, now_ns: int) -> Message:
     """Return the message for (72,) distances, left to right over the horizontal field of view; NaN: nothing known.
 
     Distances below the valid minimum become the smallest valid one; beyond `max_m` there is no obstacle.

@@ -53,8 +53,13 @@ def lay_out(stage: Path, *, libraries: bool) -> None:
         subprocess.run([*pip, *PROJECT["dependencies"]], check=True)
         shutil.rmtree(library / "bin", ignore_errors=True)
     # Compiled here and never checked again: nothing may be written beside them later, or removal would leave it.
-    compileall.compile_dir(library, stripdir=str(stage), prependdir="/", quiet=2,
-                           invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH)
+    compileall.compile_dir(
+        library,
+        stripdir=str(stage),
+        prependdir="/",
+        quiet=2,
+        invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH,
+    )
     copy(HERE / "launcher", stage / "usr/bin/morpheyes", 0o755)
     for source, target in SYSTEM_FILES.items():
         copy(ROOT / source, stage / target)
@@ -69,8 +74,9 @@ def write_control(stage: Path, *, libraries: bool) -> str:
     control.mkdir(mode=0o755)
     architecture = "all"
     if libraries:
-        architecture = subprocess.run(["dpkg", "--print-architecture"], check=True, capture_output=True,
-                                      text=True).stdout.strip()
+        architecture = subprocess.run(
+            ["dpkg", "--print-architecture"], check=True, capture_output=True, text=True
+        ).stdout.strip()
     minor = sys.version_info.minor
     values = {
         "VERSION": PROJECT["version"],

@@ -42,12 +42,21 @@ def test_only_the_command_line_prints() -> None:
 def test_overrides_are_made_in_one_place_and_sent_through_one_function() -> None:
     assert not offenders(r"rc_channels_override_message|rc_channels_override_send", "wire/")
     claims = offenders(r"\.claim_stick_output\(", "devices/")
-    # doctor has a hub of its own, for the take-over test on the ground
+    # doctor has a connection of its own, for the take-over test on the ground
     assert {claim.split(":")[0] for claim in claims} == {"daemon/composition.py", "doctor/examination.py"}
 
 
 def test_the_daemon_never_imports_the_simulator() -> None:
-    below = ("simulation/", "experiments/", "cli/", "flights/", "campaigns/", "fault_injection/", "benchmarks/", "paper/")
+    below = (
+        "simulation/",
+        "experiments/",
+        "cli/",
+        "flights/",
+        "campaigns/",
+        "fault_injection/",
+        "benchmarks/",
+        "paper/",
+    )
     assert not offenders(r"morpheyes_daemon\.(simulation|experiments)", *below)
 
 

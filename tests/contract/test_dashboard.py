@@ -37,8 +37,9 @@ class Bench:
     def fly(self, seconds: float = 1.0) -> None:
         self.flight.fly(seconds)
         t = self.clock.t_ns
-        report = Health(t, State.ENGAGED, Reason.ENGAGED, None, {"frame": float("nan")}, {"frame": 5.0}, {"depth": 1},
-                        0.4, 7.0)
+        report = Health(
+            t, State.ENGAGED, Reason.ENGAGED, None, {"frame": float("nan")}, {"frame": 5.0}, {"depth": 1}, 0.4, 7.0
+        )
         self.topics.health.publish(report)
 
     async def show(self) -> None:

@@ -10,9 +10,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-OWN = {"usr/bin/morpheyes", "usr/lib/systemd/system/morpheyes.service", "usr/lib/sysusers.d/morpheyes.conf",
-       "usr/lib/tmpfiles.d/morpheyes.conf", "usr/lib/udev/rules.d/70-morpheyes.rules", "etc/morpheyes/config.yaml",
-       "usr/lib/morpheyes/morpheyes_daemon/shipped/missions/forest.yaml"}
+OWN = {
+    "usr/bin/morpheyes",
+    "usr/lib/systemd/system/morpheyes.service",
+    "usr/lib/sysusers.d/morpheyes.conf",
+    "usr/lib/tmpfiles.d/morpheyes.conf",
+    "usr/lib/udev/rules.d/70-morpheyes.rules",
+    "etc/morpheyes/config.yaml",
+    "usr/lib/morpheyes/morpheyes_daemon/shipped/missions/forest.yaml",
+}
 
 pytestmark = [
     pytest.mark.skipif(not shutil.which("dpkg-deb"), reason="dpkg is not installed"),

@@ -17,7 +17,7 @@ from morpheyes_daemon.doctor.takeover import HandOver, TakeoverTest
 from morpheyes_daemon.doctor.vehicle import VehicleExamination
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 from morpheyes_daemon.simulation.autopilot.parameters import RECOMMENDED
-from tests.support.hub_bench import HubBench
+from tests.support.connection_bench import ConnectionBench
 from tests.unit.doctor.test_doctor_parameters import BAD
 
 
@@ -29,14 +29,14 @@ def config(**autopilot: object) -> VehicleConfig:
     )
 
 
-async def examine(bench: HubBench, **autopilot: object) -> list[Finding]:
+async def examine(bench: ConnectionBench, **autopilot: object) -> list[Finding]:
     async with VehicleExamination(config(**autopilot), bench.clock, bench.open) as vehicle:
         return await vehicle.examine()
 
 
-def on_bench(story: Callable[[HubBench], Awaitable[None]], parameters: dict[str, float] | None = None) -> None:
+def on_bench(story: Callable[[ConnectionBench], Awaitable[None]], parameters: dict[str, float] | None = None) -> None:
     async def tell() -> None:
-        async with HubBench({**RECOMMENDED, **(parameters or {})}, run_hub=False) as bench:
+        async with ConnectionBench({**RECOMMENDED, **(parameters or {})}, run_hub=False) as bench:
             await bench.sleep(3.0)
             await story(bench)
 
@@ -48,7 +48,7 @@ def ids(findings: list[Finding]) -> set[str]:
 
 
 def test_recommended_vehicle_may_fly() -> None:
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         findings = await examine(bench)
         assert verdict(findings) is Verdict.FLY, findings
 
@@ -74,7 +74,7 @@ def expected(batch: dict[str, float]) -> set[str]:
 
 @pytest.mark.parametrize("batch", batches())
 def test_bad_parameters_are_found_and_the_file_remedies_them(batch: dict[str, float], tmp_path: Path) -> None:
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         findings = await examine(bench)
         assert expected(batch) <= ids(findings)
         file = tmp_path / "remedy.parm"
@@ -89,7 +89,7 @@ def test_bad_parameters_are_found_and_the_file_remedies_them(batch: dict[str, fl
 
 
 def test_nobody_there() -> None:
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         bench.plugged = False
         [finding] = await examine(bench, url="serial:/dev/nothing")
         assert finding.id == "autopilot-missing"
@@ -99,7 +99,7 @@ def test_nobody_there() -> None:
 
 
 def test_states_of_the_vehicle() -> None:
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         bench.twin.radio.switch(on=True)
         bench.twin.battery_low(0.1)
         bench.twin.lose_flow()
@@ -114,7 +114,7 @@ def test_states_of_the_vehicle() -> None:
 
 
 def test_radio_without_the_switch_channel() -> None:
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         bench.twin.radio.set(7, 0)
         await bench.sleep(0.5)
         assert "no-switch" in ids(await examine(bench))
@@ -123,7 +123,7 @@ def test_radio_without_the_switch_channel() -> None:
 
 
 def test_slow_link_is_noticed() -> None:
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         async def thin(url: str, on_bytes: object, on_lost: object) -> object:
             count = 0
 
@@ -146,7 +146,7 @@ def test_slow_link_is_noticed() -> None:
 class Pilot:
     """Does what the take-over test says, a moment later and in its order."""
 
-    def __init__(self, bench: HubBench) -> None:
+    def __init__(self, bench: ConnectionBench) -> None:
         self._bench = bench
         self.read: list[str] = []
         self._heard: deque[str] = deque()
@@ -168,18 +168,18 @@ class Pilot:
             self._bench.twin.set_mode(Mode.ALT_HOLD)
 
 
-async def take_over(bench: HubBench, pilot: Pilot, **autopilot: object) -> tuple[list[HandOver], list[Finding]]:
+async def take_over(bench: ConnectionBench, pilot: Pilot, **autopilot: object) -> tuple[list[HandOver], list[Finding]]:
     settings = config(**autopilot)
     async with VehicleExamination(settings, bench.clock, bench.open) as vehicle:
-        await vehicle.wait(lambda: vehicle.hub.parameters.complete, 10.0)
-        output = vehicle.hub.claim_stick_output()
-        result = await TakeoverTest(vehicle.hub, output, settings.autopilot, bench.clock, pilot.say).run()
+        await vehicle.wait(lambda: vehicle.connection.parameters.complete, 10.0)
+        output = vehicle.connection.claim_stick_output()
+        result = await TakeoverTest(vehicle.connection, output, settings.autopilot, bench.clock, pilot.say).run()
         await bench.sleep(0.05)  # the last release is still on its way
         return result
 
 
 def test_takeover_is_measured_both_ways() -> None:
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         pilot = Pilot(bench)
         times, findings = await take_over(bench, pilot)
         assert findings == []
@@ -195,7 +195,7 @@ def test_takeover_is_measured_both_ways() -> None:
 
 
 def test_pilot_who_does_nothing_leaves_a_finding_and_a_release() -> None:
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         pilot = Pilot(bench)
         pilot.obeys = 0
         times, [finding] = await take_over(bench, pilot)
@@ -208,7 +208,7 @@ def test_pilot_who_does_nothing_leaves_a_finding_and_a_release() -> None:
 
 
 def test_overrides_that_are_ignored_fail_the_takeover_test() -> None:
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         _, [finding] = await take_over(bench, Pilot(bench), override_sysid=9)
         assert "do not come back" in finding.evidence
 
@@ -217,7 +217,7 @@ def test_overrides_that_are_ignored_fail_the_takeover_test() -> None:
 
 @pytest.mark.parametrize("obeyed", [0, 2])
 def test_armed_vehicle_ends_the_takeover_test_at_once(obeyed: int) -> None:
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         pilot = Pilot(bench)
         pilot.obeys = obeyed
         running = asyncio.create_task(take_over(bench, pilot))

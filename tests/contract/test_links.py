@@ -206,9 +206,7 @@ def _closed_port() -> str:
         (lambda tmp: _closed_port(), "nobody listens there"),
     ],
 )
-async def test_what_cannot_be_opened_is_one_sentence(
-    url: Callable[[Path], str], words: str, tmp_path: Path
-) -> None:
+async def test_what_cannot_be_opened_is_one_sentence(url: Callable[[Path], str], words: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a port")
     with pytest.raises(DeviceNotFoundError, match=words) as caught:
         await Ear().open(url(tmp_path))

@@ -80,9 +80,10 @@ def test_udev_makes_the_name_that_the_configuration_expects() -> None:
     assert rules.count("ID_MM_DEVICE_IGNORE") >= 3
 
 
-@pytest.mark.parametrize("line", [
-    line for line in (SYSTEMD / "70-morpheyes.rules").read_text().splitlines() if line and not line.startswith("#")
-])
+@pytest.mark.parametrize(
+    "line",
+    [line for line in (SYSTEMD / "70-morpheyes.rules").read_text().splitlines() if line and not line.startswith("#")],
+)
 def test_udev_rules_are_well_formed(line: str) -> None:
     """Comma-separated KEY OP "value"; udevadm verify comes only with systemd 254."""
     part = r'(?:[A-Z_]+(?:\{[^}]+\})?(?:==|!=|\+=|:=|=)"[^"]*")'

@@ -228,9 +228,7 @@ async def test_the_worker_ends_with_its_parent_even_while_it_hangs(tmp_path: Pat
     script = tmp_path / "parent.py"
     script.write_text(ORPHAN)
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    parent = await asyncio.create_subprocess_exec(
-        sys.executable, str(script), stdout=subprocess.PIPE, env=environment
-    )
+    parent = await asyncio.create_subprocess_exec(sys.executable, str(script), stdout=subprocess.PIPE, env=environment)
     out, _ = await parent.communicate()
     assert parent.returncode == -signal.SIGKILL
     await until(lambda: gone(int(out)))

@@ -1,4 +1,4 @@
-"""The hub on a real ArduPilot SITL, which nobody needs to have: `MORPHEYES_SITL=tcp:127.0.0.1:5760 pytest …`.
+"""The connection on a real ArduPilot SITL, which nobody needs to have: `MORPHEYES_SITL=tcp:127.0.0.1:5760 pytest …`.
 
 The vehicle stays disarmed on the ground; what the twin promises about the link is checked on the real thing.
 """
@@ -18,7 +18,7 @@ from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, Ticker, running_clock
 from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.control.loiter import LoiterModel
-from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
 from morpheyes_daemon.devices.link import open_link
 from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.messages.core import VehicleState
@@ -33,7 +33,7 @@ pytestmark = [
 
 
 class Session:
-    """A hub on the SITL, its events and its state."""
+    """A connection on the SITL, its events and its state."""
 
     def __init__(self, **config: object) -> None:
         self.clock = running_clock()
@@ -41,8 +41,8 @@ class Session:
         self.reasons: list[Reason] = []
         log.subscribe(lambda event: self.reasons.append(event.reason))
         settings = AutopilotConfig(url=URL, **config)  # type: ignore[arg-type]
-        self.hub = AutopilotHub(settings, self.clock, self.topics, log, open_link)
-        self.output = self.hub.claim_stick_output()
+        self.connection = AutopilotConnection(settings, self.clock, self.topics, log, open_link)
+        self.output = self.connection.claim_stick_output()
 
     @property
     def vehicle(self) -> VehicleState:
@@ -61,10 +61,10 @@ class Session:
 @asynccontextmanager
 async def session(**config: object) -> AsyncIterator[Session]:
     current = Session(**config)
-    running = asyncio.create_task(current.hub.run())
+    running = asyncio.create_task(current.connection.run())
     try:
         ticker = Ticker(current.clock, 20.0)
-        while not (current.hub.parameters.complete and current.vehicle.attitude_t_ns):
+        while not (current.connection.parameters.complete and current.vehicle.attitude_t_ns):
             await ticker.wait()
         yield current
     finally:
@@ -75,21 +75,21 @@ async def session(**config: object) -> AsyncIterator[Session]:
 
 async def test_parameters_streams_and_settings() -> None:
     async with session() as sitl:
-        assert len(sitl.hub.parameters.values) > 800
-        LoiterModel.from_parameters(sitl.hub.parameters.values)
-        assert sitl.hub.refused_streams == []
+        assert len(sitl.connection.parameters.values) > 800
+        LoiterModel.from_parameters(sitl.connection.parameters.values)
+        assert sitl.connection.refused_streams == []
         stamps: set[int] = set()
-        sitl.hub.on_vehicle(lambda state: stamps.add(state.attitude_t_ns))
+        sitl.connection.on_vehicle(lambda state: stamps.add(state.attitude_t_ns))
         await sitl.clock.sleep_until_ns(sitl.clock.now_ns() + 2 * S)
         order = sorted(stamps)
         # by the autopilot's own time: a loaded machine runs the SITL slower than real time
         assert median(b - a for a, b in pairwise(order)) / S == pytest.approx(0.02, abs=0.001)
-        before = sitl.hub.parameters.values["LOIT_BRK_DELAY"]
-        await sitl.hub.set_parameter("LOIT_BRK_DELAY", 0.15)
-        await sitl.hub.set_parameter("LOIT_BRK_DELAY", before)
+        before = sitl.connection.parameters.values["LOIT_BRK_DELAY"]
+        await sitl.connection.set_parameter("LOIT_BRK_DELAY", 0.15)
+        await sitl.connection.set_parameter("LOIT_BRK_DELAY", before)
         with pytest.raises(DeviceTimeoutError):
-            await sitl.hub.set_parameter("NO_SUCH_NAME", 1.0)
-        await sitl.hub.set_aux_function(40, 2)
+            await sitl.connection.set_parameter("NO_SUCH_NAME", 1.0)
+        await sitl.connection.set_aux_function(40, 2)
 
 
 async def test_overrides_are_echoed_and_released() -> None:

@@ -50,7 +50,7 @@ def plan() -> FlightPlan:
 async def cruising(plan: FlightPlan, folder: Path, autopilot: str | None) -> AsyncIterator[RealtimeFlight]:
     """A flight that goes through the forest at more than a walk."""
     async with realtime_daemon(plan, folder / "flight.mcap", autopilot, lambda progress: None) as flight:
-        await until(flight, lambda: flight.daemon.guardian.state is State.ENGAGED and speed(flight) > CRUISE_M_S)
+        await until(flight, lambda: flight.daemon.monitor.state is State.ENGAGED and speed(flight) > CRUISE_M_S)
         yield flight
 
 
@@ -63,7 +63,7 @@ async def until(flight: RealtimeFlight, done: Callable[[], bool], limit_s: float
     clock = running_clock()
     ticker, end_ns = Ticker(clock, 50.0), clock.now_ns() + round(limit_s * S)
     while not done():
-        assert clock.now_ns() < end_ns, f"{flight.daemon.guardian.state}: {flight.daemon.guardian.reason.text}"
+        assert clock.now_ns() < end_ns, f"{flight.daemon.monitor.state}: {flight.daemon.monitor.reason.text}"
         assert not flight.running.done()
         if flight.simulator.verdict.done():
             flight.simulator.verdict.result()  # raises what ended the simulator
@@ -84,15 +84,13 @@ def test_the_forest_mission_is_reached(plan: FlightPlan, tmp_path: Path, autopil
 
 @both
 @pytest.mark.parametrize("act", list(PilotAct))
-async def test_the_pilot_takes_over(
-    plan: FlightPlan, tmp_path: Path, autopilot: str | None, act: PilotAct
-) -> None:
+async def test_the_pilot_takes_over(plan: FlightPlan, tmp_path: Path, autopilot: str | None, act: PilotAct) -> None:
     async with cruising(plan, tmp_path, autopilot) as flight:
         outputs: list[GateOutput] = []
         flight.daemon.topics.gate.tap(outputs.append)
         flight.simulator.ask_pilot(act)
         wanted = State.RELEASED if act is PilotAct.SWITCH_OFF else State.PILOT
-        await until(flight, lambda: flight.daemon.guardian.state is wanted, 10.0)
+        await until(flight, lambda: flight.daemon.monitor.state is wanted, 10.0)
         held = [out.action in (Action.STICKS, Action.NEUTRAL) for out in outputs]
         await asyncio.sleep(1.0)
         later = [out.action for out in outputs[len(held) :]]
@@ -110,7 +108,7 @@ async def test_a_daemon_cut_off_leaves_a_vehicle_that_stops_within_the_reserve(
         assert before is not None
         assert governed is not None
         reserve_m = min(governed.clear_m, governed.trust_m) - STANDOFF_M
-        daemon.hub.transmitter.link = None  # nothing of ours goes out any more; what comes in still does
+        daemon.connection.transmitter.link = None  # nothing of ours goes out any more; what comes in still does
         farthest_m = 0.0
         clock = running_clock()
         end_ns = clock.now_ns() + round(AFTER_S * S)
@@ -128,7 +126,7 @@ async def test_lost_aiding_is_braked_for_while_there_is_something_to_brake_on(
     plan: FlightPlan, tmp_path: Path, autopilot: str
 ) -> None:
     async with cruising(plan, tmp_path, autopilot) as flight:
-        on_gps = flight.daemon.hub.parameters.values["GPS1_TYPE"] != 0
+        on_gps = flight.daemon.connection.parameters.values["GPS1_TYPE"] != 0
         sensor = "SIM_GPS1_ENABLE" if on_gps else "SIM_FLOW_ENABLE"
         await until(flight, lambda: speed(flight) > FAST_M_S)
         before_m_s = speed(flight)
@@ -136,10 +134,10 @@ async def test_lost_aiding_is_braked_for_while_there_is_something_to_brake_on(
         lost_ns = clock.now_ns()
         simulate_sensor(flight, sensor, on=False)
         try:
-            await until(flight, lambda: flight.daemon.guardian.state is State.BRAKING, 2.0)
+            await until(flight, lambda: flight.daemon.monitor.state is State.BRAKING, 2.0)
             braking_s = (clock.now_ns() - lost_ns) / S
-            assert flight.daemon.guardian.reason is Reason.AIDING_LOST
-            await until(flight, lambda: flight.daemon.guardian.state is State.PILOT, 15.0)
+            assert flight.daemon.monitor.reason is Reason.AIDING_LOST
+            await until(flight, lambda: flight.daemon.monitor.state is State.PILOT, 15.0)
             failsafe_s, left_m_s = (clock.now_ns() - lost_ns) / S, speed(flight)
             print(f"{sensor}: brakes after {braking_s:.2f} s from {before_m_s:.2f} m/s,", end=" ")
             print(f"failsafe after {failsafe_s:.2f} s at {left_m_s:.2f} m/s")
@@ -150,7 +148,7 @@ async def test_lost_aiding_is_braked_for_while_there_is_something_to_brake_on(
 
 def simulate_sensor(flight: RealtimeFlight, name: str, *, on: bool) -> None:
     """Give SITL its sensor or take it away, over the daemon's own link."""
-    link = flight.daemon.hub.transmitter.link
+    link = flight.daemon.connection.transmitter.link
     assert link is not None
     message = mavlink.MAVLink_param_set_message(1, 1, name.encode(), float(on), mavlink.MAV_PARAM_TYPE_INT8)
     link.write(message.pack(mavlink.MAVLink(None, 255, 190)))

@@ -54,9 +54,20 @@ class Weaver(Strategy):
         clear_m = min(sighting.nearest_m, observation.reserve_m)
         assert isinstance(self.parameters, WeaverParameters)
         return MissionCommand(
-            observation.summary.seq, observation.now_ns, observation.now_ns + S, Intent.FLY, None,
-            (math.cos(self._sum), math.sin(self._sum), 0.0), self._sum, None, self.parameters.gain * clear_m, clear_m,
-            observation.summary.t_ns, observation.at_exposure.p_ned_m, clear_m, detail={"sum": self._sum},
+            observation.summary.seq,
+            observation.now_ns,
+            observation.now_ns + S,
+            Intent.FLY,
+            None,
+            (math.cos(self._sum), math.sin(self._sum), 0.0),
+            self._sum,
+            None,
+            self.parameters.gain * clear_m,
+            clear_m,
+            observation.summary.t_ns,
+            observation.at_exposure.p_ned_m,
+            clear_m,
+            detail={"sum": self._sum},
         )
 
 
@@ -75,8 +86,22 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     strategy = Weaver(WeaverParameters(), build_craft(config))
     for k in range(STEPS):
         clock.t_ns += S // 5
-        summary = DepthSummary(k, clock.t_ns - S // 10, clock.t_ns, 0.2, 0.001, 370.0, 0.82, 0.25, 0.5, 0.9, 0.0,
-                               9.0 - 0.3 * k, 0.05, "5f1e")
+        summary = DepthSummary(
+            k,
+            clock.t_ns - S // 10,
+            clock.t_ns,
+            0.2,
+            0.001,
+            370.0,
+            0.82,
+            0.25,
+            0.5,
+            0.9,
+            0.0,
+            9.0 - 0.3 * k,
+            0.05,
+            "5f1e",
+        )
         points = rng.normal(size=(k % 4 * 30, 2)).astype(np.float32)
         sighting = Sighting(points, math.inf if k % 7 == 0 else float(rng.uniform(1, 9)))
         topics.perception.publish(Perception(summary, sighting, np.full(72, math.nan, np.float32)))

@@ -370,7 +370,12 @@ def main() -> int:
         print(*mutants, sep="\n")
         return 0
     os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
-    for preload in ("pytest", "hypothesis.stateful", "morpheyes_daemon.config.vehicle", "morpheyes_daemon.messages.core"):
+    for preload in (
+        "pytest",
+        "hypothesis.stateful",
+        "morpheyes_daemon.config.vehicle",
+        "morpheyes_daemon.messages.core",
+    ):
         importlib.import_module(preload)
     if _fails_unchanged(modules[0], texts[modules[0]]):
         print("The tests fail without any change: mend them first.")

@@ -1,6 +1,6 @@
 """A daemon whose links a test holds in its hands, and the noise that is poured into them.
 
-The daemon is the real one, put together by app.py, without cameras: its hub, its guardian and its servo live on
+The daemon is the real one, put together by app.py, without cameras: its connection, its monitor and its servo live on
 virtual time; what it sends is kept, what it hears is whatever the test says.
 """
 
@@ -126,7 +126,7 @@ class NoisyDaemon:
         for lease in (Lease.FRAME, Lease.DEPTH, Lease.MISSION):
             self.daemon.gate.renew(lease, now_ns + S)
         self.daemon.gate.offer(Sticks(now_ns, now_ns + S, 1900, 1100, 1900, 1100))
-        self.states[self.daemon.guardian.state] += 1
+        self.states[self.daemon.monitor.state] += 1
         await self.clock.sleep_until_ns(now_ns + round(seconds * S))
         assert not any(life.done() for life in self._lives), "the daemon died"
 

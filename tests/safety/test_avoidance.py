@@ -12,7 +12,7 @@ from morpheyes_daemon.clock import S, run_virtual, running_clock
 from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig
 from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.messages.safety import State
-from morpheyes_daemon.safety.monitor import Guardian
+from morpheyes_daemon.safety.monitor import SafetyMonitor
 from morpheyes_daemon.safety.states import HOLDING
 from morpheyes_daemon.supervisor.supervisor import Pulse
 from morpheyes_daemon.tasks.avoidance import avoidance
@@ -33,7 +33,7 @@ class Switch:
 
 
 class Flight:
-    """Stands in for the guardian: a state."""
+    """Stands in for the monitor: a state."""
 
     state = State.STANDBY
 
@@ -43,7 +43,7 @@ def told(story: Callable[[Flight, Switch], list[State]]) -> list[tuple[int, int]
 
     async def live() -> list[tuple[int, int]]:
         clock, switch, flight = running_clock(), Switch(), Flight()
-        task = asyncio.create_task(avoidance(switch, cast(Guardian, flight), clock, Pulse(clock)))
+        task = asyncio.create_task(avoidance(switch, cast(SafetyMonitor, flight), clock, Pulse(clock)))
         for state in story(flight, switch):
             flight.state = state
             await clock.sleep_until_ns(clock.now_ns() + S)
@@ -81,7 +81,7 @@ def test_a_refusal_is_raised_so_that_the_supervisor_tries_again() -> None:
     async def live() -> None:
         clock, switch = running_clock(), Switch()
         switch.deaf = True
-        await avoidance(switch, cast(Guardian, Flight()), clock, Pulse(clock))
+        await avoidance(switch, cast(SafetyMonitor, Flight()), clock, Pulse(clock))
 
     with pytest.raises(DeviceTimeoutError):
         run_virtual(live())

@@ -20,7 +20,7 @@ def test_neutral_is_the_first_thing_after(held_up_s: float, noticed: bool) -> No
         async with NoisyDaemon(NoServoConfig(backend="none")) as noisy:
             await noisy.pass_time(0.51)  # between two stick periods
             noisy.links["autopilot"].on_bytes = lambda data: None  # it would say that nobody has armed it
-            machine = noisy.daemon.guardian.machine
+            machine = noisy.daemon.monitor.machine
             machine.state, machine.since_ns = State.ENGAGED, noisy.clock.now_ns()
             for _ in range(3):
                 await noisy.pass_time(0.02)

@@ -26,20 +26,20 @@ DANGEROUS = [
 def test_a_dangerous_parameter_keeps_it_from_standing_by(name: str, bad: float, finding: str) -> None:
     async def life() -> None:
         async with NoisyDaemon(NoServoConfig(backend="none")) as noisy:
-            guardian, hub = noisy.daemon.guardian, noisy.daemon.hub
+            monitor, connection = noisy.daemon.monitor, noisy.daemon.connection
             await noisy.pass_time(0.5)
-            assert guardian.missing is None
-            assert guardian.state is State.STANDBY
-            good = hub.parameters.values[name]
-            await hub.set_parameter(name, bad)
+            assert monitor.missing is None
+            assert monitor.state is State.STANDBY
+            good = connection.parameters.values[name]
+            await connection.set_parameter(name, bad)
             await noisy.pass_time(0.5)
-            assert guardian.state is State.PREFLIGHT
-            assert guardian.reason is Reason.DOCTOR_SAYS_NO
+            assert monitor.state is State.PREFLIGHT
+            assert monitor.reason is Reason.DOCTOR_SAYS_NO
             said = [event.text for event in noisy.events if event.reason is Reason.DOCTOR_SAYS_NO]
             assert [text for text in said if text.startswith(finding)]
-            await hub.set_parameter(name, good)
+            await connection.set_parameter(name, good)
             await noisy.pass_time(0.5)
-            assert guardian.state is State.STANDBY
+            assert monitor.state is State.STANDBY
 
     run_virtual(life())
 
@@ -47,11 +47,11 @@ def test_a_dangerous_parameter_keeps_it_from_standing_by(name: str, bad: float, 
 def test_a_servo_that_never_answered_is_waited_for_in_preflight() -> None:
     async def life() -> None:
         async with NoisyDaemon(SerialServoConfig(backend="serial", url="memory:servo")) as noisy:
-            guardian = noisy.daemon.guardian
+            monitor = noisy.daemon.monitor
             for _ in range(20):
                 await noisy.pass_time(0.5)
-            assert guardian.missing is Reason.SERVO_LOST
-            assert guardian.state is State.PREFLIGHT
+            assert monitor.missing is Reason.SERVO_LOST
+            assert monitor.state is State.PREFLIGHT
             assert State.FAULT not in noisy.states
 
     run_virtual(life())
@@ -61,14 +61,14 @@ def test_a_servo_that_never_answered_is_waited_for_in_preflight() -> None:
 def test_nobody_engages_while_the_servo_is_in_trouble(trouble: Reason) -> None:
     async def life() -> None:
         async with NoisyDaemon(NoServoConfig(backend="none")) as noisy:
-            guardian = noisy.daemon.guardian
+            monitor = noisy.daemon.monitor
             await noisy.pass_time(0.5)
-            assert guardian.state is State.STANDBY
+            assert monitor.state is State.STANDBY
             for reason, state in ((trouble, State.PREFLIGHT), (Reason.RECOVERED, State.STANDBY)):
                 noisy.daemon.events.publish(Event(noisy.clock.now_ns(), "servo", reason))
                 await noisy.pass_time(0.1)
-                assert guardian.state is state
-                assert guardian.missing is (trouble if state is State.PREFLIGHT else None)
+                assert monitor.state is state
+                assert monitor.missing is (trouble if state is State.PREFLIGHT else None)
 
     run_virtual(life())
 
@@ -77,12 +77,12 @@ def test_nobody_engages_while_the_servo_is_in_trouble(trouble: Reason) -> None:
 def test_what_devices_and_images_tell_stops_a_flight_on_the_spot(reason: Reason) -> None:
     async def life() -> None:
         async with NoisyDaemon(NoServoConfig(backend="none")) as noisy:
-            guardian = noisy.daemon.guardian
+            monitor = noisy.daemon.monitor
             await noisy.pass_time(0.5)
-            guardian.machine.state = State.ENGAGED
+            monitor.machine.state = State.ENGAGED
             noisy.daemon.events.publish(Event(noisy.clock.now_ns(), "somebody", reason))
-            assert guardian.state is State.BRAKING
-            assert guardian.reason is reason
+            assert monitor.state is State.BRAKING
+            assert monitor.reason is reason
             assert noisy.overrides[-1] == (1500, 1500, 1500, 1500), "neutral on the spot"
 
     run_virtual(life())

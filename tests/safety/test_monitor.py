@@ -1,4 +1,4 @@
-"""What the guardian makes of what it hears: getting ready, engaging, braking, resuming, holding, leaving."""
+"""What the monitor makes of what it hears: getting ready, engaging, braking, resuming, holding, leaving."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from morpheyes_daemon.messages.safety import Action, State
 from morpheyes_daemon.safety.gate import RELEASE_REPEATS
 from morpheyes_daemon.safety.leases import LEASE_REASONS, Lease
 from morpheyes_daemon.safety.monitor import (
-    NOT_RESUMED,
+    REQUESTED_STOPS,
     RESUMED,
-    Guardian,
-    GuardianLimits,
+    SafetyMonitor,
+    SafetyMonitorLimits,
 )
 from morpheyes_daemon.safety.states import EFFECTS, HOLDING, Trigger
 from tests.support.cockpit import LIMITS, OFF_US, ON_US, OTHER_LIMITS, Actor, Cockpit
@@ -33,7 +33,7 @@ def actions(cockpit: Cockpit, seconds: float) -> set[Action]:
 
 
 def is_in(cockpit: Actor, state: State, reason: Reason) -> None:
-    assert (cockpit.state, cockpit.guardian.reason) == (state, reason)
+    assert (cockpit.state, cockpit.monitor.reason) == (state, reason)
 
 
 # -- getting ready ----------------------------------------------------------------------------------------------
@@ -42,10 +42,10 @@ def is_in(cockpit: Actor, state: State, reason: Reason) -> None:
 def test_a_new_guardian_waits_for_what_the_daemon_still_misses() -> None:
     actor = Actor()
     is_in(actor, State.BOOT, Reason.STARTED)
-    assert actor.guardian.missing is Reason.STARTED
-    assert not actor.guardian.let_go
+    assert actor.monitor.missing is Reason.STARTED
+    assert not actor.monitor.let_go
     assert actor.step().action is Action.SILENT
-    actor.guardian.boot_done(actor.now_ns)
+    actor.monitor.boot_done(actor.now_ns)
     actor.step()
     is_in(actor, State.PREFLIGHT, Reason.STARTED)
 
@@ -53,7 +53,7 @@ def test_a_new_guardian_waits_for_what_the_daemon_still_misses() -> None:
 def test_what_is_missing_is_named_one_by_one() -> None:
     cockpit = Cockpit().into(State.PREFLIGHT)
     cockpit.set_missing(Reason.DOCTOR_SAYS_NO)
-    assert cockpit.guardian.missing is Reason.DOCTOR_SAYS_NO
+    assert cockpit.monitor.missing is Reason.DOCTOR_SAYS_NO
     cockpit.step()
     is_in(cockpit, State.PREFLIGHT, Reason.DOCTOR_SAYS_NO)
     cockpit.set_missing(None)
@@ -67,23 +67,23 @@ def test_what_is_missing_is_named_one_by_one() -> None:
 
 
 def test_what_one_source_no_longer_misses_hides_nothing_that_another_does() -> None:
-    guardian = Actor().guardian
-    guardian.set_missing(Reason.DOCTOR_SAYS_NO, "doctor")
-    assert guardian.missing is Reason.STARTED
-    guardian.set_missing(None)
-    assert guardian.missing is Reason.DOCTOR_SAYS_NO
-    guardian.set_missing(None, "another")
-    assert guardian.missing is Reason.DOCTOR_SAYS_NO
-    guardian.set_missing(None, "doctor")
-    assert guardian.missing is None
+    monitor = Actor().monitor
+    monitor.set_missing(Reason.DOCTOR_SAYS_NO, "doctor")
+    assert monitor.missing is Reason.STARTED
+    monitor.set_missing(None)
+    assert monitor.missing is Reason.DOCTOR_SAYS_NO
+    monitor.set_missing(None, "another")
+    assert monitor.missing is Reason.DOCTOR_SAYS_NO
+    monitor.set_missing(None, "doctor")
+    assert monitor.missing is None
 
 
 def test_a_vehicle_without_stamps_is_not_heard_in_the_clocks_first_instants() -> None:
     actor = Actor(now_ns=100 * MS)
     actor.heartbeat()
-    assert not actor.guardian.gate.is_fresh(Lease.VEHICLE, actor.now_ns)
+    assert not actor.monitor.gate.is_fresh(Lease.VEHICLE, actor.now_ns)
     actor.motion()
-    assert actor.guardian.gate.is_fresh(Lease.VEHICLE, actor.now_ns)
+    assert actor.monitor.gate.is_fresh(Lease.VEHICLE, actor.now_ns)
 
 
 @pytest.mark.parametrize("lease", Lease)
@@ -159,11 +159,11 @@ def test_a_receiver_without_the_switchs_channel_is_not_heard() -> None:
 def test_radio_channels_without_a_stamp_were_never_heard() -> None:
     actor = Actor(now_ns=0)
     actor.hear(rc_t_ns=0, rc_us=(OFF_US,) * 8)
-    assert not actor.guardian.gate.is_fresh(Lease.SWITCH, 0)
+    assert not actor.monitor.gate.is_fresh(Lease.SWITCH, 0)
 
 
 def test_the_switch_may_be_on_another_channel() -> None:
-    cockpit = Cockpit(GuardianLimits(engage_channel=16, engage_above_us=1400)).into(State.PREFLIGHT)
+    cockpit = Cockpit(SafetyMonitorLimits(engage_channel=16, engage_above_us=1400)).into(State.PREFLIGHT)
     cockpit.set_missing(None)
     cockpit.set_limits(LIMITS)
     cockpit.silent.add(Lease.SWITCH)
@@ -235,7 +235,7 @@ def test_a_flip_while_booting_is_not_used_up_before_it_can_engage() -> None:
     cockpit.switch_us = ON_US
     cockpit.run(0.4)
     is_in(cockpit, State.BOOT, Reason.STARTED)
-    cockpit.guardian.boot_done(cockpit.now_ns)
+    cockpit.monitor.boot_done(cockpit.now_ns)
     cockpit.run(0.1)
     assert cockpit.state is State.ENGAGED
 
@@ -438,7 +438,7 @@ def test_a_complaint_while_braking_for_less_ends_the_hope_of_flying_on() -> None
 
 
 def test_the_ground_stations_loss_brakes_when_it_is_watched() -> None:
-    cockpit = Cockpit(GuardianLimits(gcs_timeout_s=2.0)).engage()
+    cockpit = Cockpit(SafetyMonitorLimits(gcs_timeout_s=2.0)).engage()
     cockpit.hear(gcs_t_ns=cockpit.now_ns)
     assert actions(cockpit, 1.98) == {Action.STICKS}
     assert cockpit.period().action is Action.NEUTRAL
@@ -460,7 +460,7 @@ def test_at_rest_braking_for_good_is_over(speed_m_s: float, holds: bool) -> None
     cockpit.mission_over(Reason.GOAL_REACHED)
     cockpit.period()
     assert (cockpit.state is State.HOLD) is holds
-    assert cockpit.guardian.reason is Reason.GOAL_REACHED
+    assert cockpit.monitor.reason is Reason.GOAL_REACHED
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -482,7 +482,7 @@ def test_braking_ends_in_time_though_the_vehicle_is_not_known_to_rest(stale: boo
         cockpit.said["v_ned_m_s"] = (0.0, 0.0, 0.0)
         cockpit.run(0.4)
     cockpit.mission_over(Reason.MISSION_REFUSED)
-    since_ns = cockpit.guardian.machine.since_ns
+    since_ns = cockpit.monitor.machine.since_ns
     while cockpit.state is State.BRAKING:
         cockpit.period()
     assert 4.0 * S <= cockpit.now_ns - since_ns < 4.0 * S + 20 * MS
@@ -515,7 +515,7 @@ def test_the_end_of_the_mission_stops_at_once_and_for_good(reason: Reason) -> No
     assert [out.action for out in cockpit.sent[count:]] == [Action.NEUTRAL]
     assert actions(cockpit, 10.0) == {Action.NEUTRAL}
     is_in(cockpit, State.HOLD, reason)
-    assert reason in NOT_RESUMED
+    assert reason in REQUESTED_STOPS
 
 
 def test_a_refusal_while_braking_ends_the_hope_of_flying_on() -> None:
@@ -541,16 +541,16 @@ def test_a_stop_that_somebody_asked_for_is_told_from_a_want() -> None:
     for stop in (Reason.GOAL_REACHED, Reason.MISSION_REFUSED):
         cockpit = Cockpit().engage()
         cockpit.mission_over(stop)
-        assert cockpit.guardian.reason in NOT_RESUMED
+        assert cockpit.monitor.reason in REQUESTED_STOPS
     cockpit = Cockpit().engage()
     cockpit.shutdown()
-    assert cockpit.guardian.reason in NOT_RESUMED
-    assert Cockpit().into(State.BRAKING).guardian.reason not in NOT_RESUMED
-    assert Cockpit().into(State.FAULT).guardian.reason not in NOT_RESUMED
+    assert cockpit.monitor.reason in REQUESTED_STOPS
+    assert Cockpit().into(State.BRAKING).monitor.reason not in REQUESTED_STOPS
+    assert Cockpit().into(State.FAULT).monitor.reason not in REQUESTED_STOPS
 
 
 def test_reasons_that_are_flown_on_are_no_stops() -> None:
-    assert not RESUMED & set(NOT_RESUMED)
+    assert not RESUMED & set(REQUESTED_STOPS)
     assert {LEASE_REASONS[lease] for lease in OWN} == RESUMED
     assert not RESUMED & {LEASE_REASONS[lease] for lease in PILOTS}
 
@@ -632,12 +632,12 @@ def test_several_faults_are_all_waited_for() -> None:
 
 def test_a_fault_and_its_end_without_a_source_are_the_same_fault() -> None:
     cockpit = Cockpit().stand_by()
-    cockpit.guardian.fault(Reason.SERVO_LOST, cockpit.now_ns)
+    cockpit.monitor.fault(Reason.SERVO_LOST, cockpit.now_ns)
     assert cockpit.state is State.FAULT
-    cockpit.guardian.clear(Reason.SERVO_LOST, cockpit.now_ns, "")
+    cockpit.monitor.clear(Reason.SERVO_LOST, cockpit.now_ns, "")
     assert cockpit.state is State.PREFLIGHT
-    cockpit.guardian.fault(Reason.SERVO_LOST, cockpit.now_ns, "")
-    cockpit.guardian.clear(Reason.SERVO_LOST, cockpit.now_ns)
+    cockpit.monitor.fault(Reason.SERVO_LOST, cockpit.now_ns, "")
+    cockpit.monitor.clear(Reason.SERVO_LOST, cockpit.now_ns)
     assert cockpit.state is State.PREFLIGHT
 
 
@@ -675,11 +675,11 @@ def test_engaging_without_any_offer_is_a_fault_too() -> None:
 @pytest.mark.parametrize("reason", [Reason.OVERRIDE_IGNORED, Reason.AUTOPILOT_REBOOTED])
 def test_an_alarm_in_flight_stops_for_good_and_outside_means_nothing(reason: Reason) -> None:
     cockpit = Cockpit().stand_by()
-    cockpit.guardian.alarm(reason, cockpit.now_ns)
+    cockpit.monitor.alarm(reason, cockpit.now_ns)
     is_in(cockpit, State.STANDBY, Reason.READY)
     cockpit.engage()
     count = len(cockpit.sent)
-    cockpit.guardian.alarm(reason, cockpit.now_ns)
+    cockpit.monitor.alarm(reason, cockpit.now_ns)
     assert [(out.action, out.reason) for out in cockpit.sent[count:]] == [(Action.NEUTRAL, reason)]
     assert actions(cockpit, 5.0) == {Action.NEUTRAL}
     is_in(cockpit, State.HOLD, reason)
@@ -716,7 +716,7 @@ def test_a_link_lost_in_the_very_period_after_engaging_is_let_go_too() -> None:
     cockpit.wait(round(0.48 * S))
     cockpit.period()
     is_in(cockpit, State.BRAKING, Reason.LINK_LOST)
-    assert cockpit.guardian.since_ns == cockpit.now_ns
+    assert cockpit.monitor.since_ns == cockpit.now_ns
     assert actions(cockpit, 1.98) == {Action.NEUTRAL}
     assert cockpit.period().action is Action.RELEASE
 
@@ -790,7 +790,7 @@ def test_a_clock_that_goes_back_is_not_flown_on(back_ns: int) -> None:
     cockpit.wait(-back_ns)
     assert cockpit.step().action is Action.NEUTRAL
     is_in(cockpit, State.BRAKING, Reason.CLOCK_STEPPED)
-    assert not any(cockpit.guardian.gate.is_fresh(lease, cockpit.now_ns) for lease in Lease)
+    assert not any(cockpit.monitor.gate.is_fresh(lease, cockpit.now_ns) for lease in Lease)
     assert actions(cockpit, 8.0) == {Action.NEUTRAL}
     is_in(cockpit, State.HOLD, Reason.CLOCK_STEPPED)
     cockpit.switch_us = OFF_US
@@ -850,16 +850,16 @@ def test_clock_and_pauses_are_no_fault_outside_flight(state: State) -> None:
 def test_shutdown_ends_in_released_from_every_state(state: State) -> None:
     cockpit = Cockpit().into(state)
     held = state in HOLDING
-    cockpit.guardian.gate.step(state, Reason.READY, cockpit.now_ns)
+    cockpit.monitor.gate.step(state, Reason.READY, cockpit.now_ns)
     began_ns, count = cockpit.now_ns, len(cockpit.sent)
     cockpit.shutdown()
     assert [out.action for out in cockpit.sent[count:]] == [Action.NEUTRAL] * held
-    assert cockpit.guardian.let_go is (state in OUTSIDE and cockpit.guardian.gate.silent)
-    while not cockpit.guardian.let_go:
+    assert cockpit.monitor.let_go is (state in OUTSIDE and cockpit.monitor.gate.silent)
+    while not cockpit.monitor.let_go:
         cockpit.period()
     if state not in (State.RELEASED, State.PILOT):
         assert [out.action for out in cockpit.sent[count:]].count(Action.RELEASE) >= RELEASE_REPEATS * held
-    is_in(cockpit, State.RELEASED, cockpit.guardian.reason if state is State.RELEASED else Reason.SHUTDOWN)
+    is_in(cockpit, State.RELEASED, cockpit.monitor.reason if state is State.RELEASED else Reason.SHUTDOWN)
     if held:
         assert 2.8 * S <= cockpit.now_ns - began_ns <= 3.1 * S
     cockpit.switch_us = OFF_US
@@ -886,7 +886,7 @@ def test_the_pilot_takes_over_while_the_daemon_leaves() -> None:
     cockpit.rc(OFF_US)
     is_in(cockpit, State.RELEASED, Reason.SWITCH_OFF)
     cockpit.run(3.0)
-    assert cockpit.guardian.let_go
+    assert cockpit.monitor.let_go
 
 
 def test_a_fault_while_leaving_changes_nothing_outside_flight() -> None:
@@ -909,7 +909,7 @@ def test_the_last_way_out_releases_from_every_state_and_sends_no_stick_after(sta
     cockpit.run(2.0)
     cockpit.switch_us = ON_US
     assert actions(cockpit, 2.0) == {Action.SILENT}
-    assert cockpit.guardian.let_go
+    assert cockpit.monitor.let_go
 
 
 # -- the rest ---------------------------------------------------------------------------------------------------
@@ -919,15 +919,15 @@ def test_transitions_are_told_after_the_gate_has_acted() -> None:
     seen: list[tuple[State, int]] = []
     cockpit = Cockpit().engage()
     count = len(cockpit.sent)
-    cockpit.guardian._on_transition = lambda step: seen.append((step.after, len(cockpit.sent)))
+    cockpit.monitor._on_transition = lambda step: seen.append((step.after, len(cockpit.sent)))
     cockpit.rc(OFF_US)
     assert seen == [(State.RELEASED, count + 1)]
 
 
 def test_nobody_need_listen_to_transitions() -> None:
-    guardian = Guardian(Actor().guardian.gate, GuardianLimits())
-    guardian.boot_done(1)
-    assert guardian.state is State.PREFLIGHT
+    monitor = SafetyMonitor(Actor().monitor.gate, SafetyMonitorLimits())
+    monitor.boot_done(1)
+    assert monitor.state is State.PREFLIGHT
 
 
 def test_what_a_step_returns_is_what_was_sent() -> None:
@@ -971,7 +971,7 @@ def test_the_limits_come_from_the_configuration() -> None:
             link_timeout_s=0.54, engage_channel=9, engage_above_us=1650, watch_gcs=True, gcs_timeout_s=7.0
         ),
     )
-    assert GuardianLimits.of(config) == GuardianLimits(
+    assert SafetyMonitorLimits.of(config) == SafetyMonitorLimits(
         vehicle_timeout_s=0.31,
         switch_timeout_s=0.52,
         link_timeout_s=0.54,
@@ -982,12 +982,12 @@ def test_the_limits_come_from_the_configuration() -> None:
         gcs_timeout_s=7.0,
     )
     unwatched = config.model_copy(update={"autopilot": AutopilotConfig()})
-    assert GuardianLimits.of(unwatched).gcs_timeout_s is None
+    assert SafetyMonitorLimits.of(unwatched).gcs_timeout_s is None
 
 
 def test_the_ages_are_those_of_the_configurations_defaults() -> None:
     config = VehicleConfig(camera=SimCameraConfig(), servo=NoServoConfig(backend="none"))
-    assert GuardianLimits.of(config) == GuardianLimits()
+    assert SafetyMonitorLimits.of(config) == SafetyMonitorLimits()
 
 
 @pytest.mark.parametrize("lease", [Lease.VEHICLE, Lease.LINK, Lease.SWITCH])
@@ -998,5 +998,5 @@ def test_leases_last_from_when_the_message_was_measured(lease: Lease) -> None:
     cockpit.hear(attitude_t_ns=stamp_ns, position_t_ns=stamp_ns + 5, heartbeat_t_ns=stamp_ns)
     cockpit.rc(OFF_US, stamp_ns)
     lasts_ns = {Lease.VEHICLE: 300 * MS}.get(lease, 500 * MS)
-    assert cockpit.guardian.gate.is_fresh(lease, stamp_ns + lasts_ns - 1)
-    assert not cockpit.guardian.gate.is_fresh(lease, stamp_ns + lasts_ns)
+    assert cockpit.monitor.gate.is_fresh(lease, stamp_ns + lasts_ns - 1)
+    assert not cockpit.monitor.gate.is_fresh(lease, stamp_ns + lasts_ns)

@@ -15,7 +15,7 @@ from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.leases import Lease
-from morpheyes_daemon.safety.monitor import GuardianLimits
+from morpheyes_daemon.safety.monitor import SafetyMonitorLimits
 from tests.support.cockpit import HEALTHY, LIMITS, OFF_US, ON_US, OTHER_LIMITS, Cockpit
 
 OURS = (Lease.SUPERVISOR, Lease.FRAME, Lease.DEPTH, Lease.MISSION)
@@ -26,11 +26,11 @@ class Chaos(Cockpit):
     """A cockpit in which anything may happen; most turns are ordinary stick periods, so that flying happens too."""
 
     def __init__(self, rng: random.Random) -> None:
-        super().__init__(GuardianLimits(gcs_timeout_s=3.0 if rng.random() < 0.3 else None))
+        super().__init__(SafetyMonitorLimits(gcs_timeout_s=3.0 if rng.random() < 0.3 else None))
         self._rng = rng
         self._ready_ns = self.now_ns
         self.seen: Counter[str] = Counter()
-        self.guardian.boot_done(self.now_ns)
+        self.monitor.boot_done(self.now_ns)
         self.set_missing(None)
         if rng.random() < 0.9:
             self.set_limits(LIMITS)
@@ -173,7 +173,7 @@ def walk(seed: int, steps: int) -> Counter[str]:
             chaos.shutdown()
         for _ in range(300):
             chaos.period()
-        assert chaos.guardian.let_go
+        assert chaos.monitor.let_go
         counts += chaos.witness.counts + chaos.seen
     return counts
 

@@ -12,7 +12,7 @@ from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, State
 from morpheyes_daemon.safety.leases import Lease
-from morpheyes_daemon.safety.monitor import GuardianLimits
+from morpheyes_daemon.safety.monitor import SafetyMonitorLimits
 from morpheyes_daemon.safety.states import EFFECTS, HOLDING
 from tests.support.cockpit import HEALTHY, LIMITS, OFF_US, ON_US, OTHER_LIMITS, Cockpit
 
@@ -26,7 +26,7 @@ class GuardianRules(RuleBasedStateMachine):
 
     @initialize(state=st.sampled_from(list(State)), gcs=st.none() | st.just(4.0))
     def start(self, state: State, gcs: float | None) -> None:
-        self.cockpit = Cockpit(GuardianLimits(gcs_timeout_s=gcs)).into(state)
+        self.cockpit = Cockpit(SafetyMonitorLimits(gcs_timeout_s=gcs)).into(state)
 
     @rule(periods=st.integers(1, 30))
     def live(self, periods: int) -> None:

@@ -34,7 +34,7 @@ def take_over(cockpit: Cockpit, way: str) -> None:
     count = len(cockpit.sent)
     act(cockpit)
     assert [(out.action, out.reason) for out in cockpit.sent[count:]] == [(Action.RELEASE, reason)]
-    assert (cockpit.state, cockpit.guardian.reason) == (state, reason)
+    assert (cockpit.state, cockpit.monitor.reason) == (state, reason)
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -11,7 +11,7 @@ import pytest
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.safety.vehicle_health import concern
+from morpheyes_daemon.safety.vehicle_health import vehicle_fault
 
 NOW_NS = 1000 * S
 WELL = VehicleState(system_status=4, ekf_t_ns=1, ekf_flags=0x08, battery_fraction=0.8, gcs_t_ns=NOW_NS)
@@ -63,12 +63,12 @@ WELL = VehicleState(system_status=4, ekf_t_ns=1, ekf_flags=0x08, battery_fractio
     ],
 )
 def test_each_concern(changes: dict[str, Any], reason: Reason | None) -> None:
-    assert concern(replace(WELL, **changes), NOW_NS, battery_low=0.2, gcs_timeout_s=5.0) is reason
+    assert vehicle_fault(replace(WELL, **changes), NOW_NS, battery_low=0.2, gcs_timeout_s=5.0) is reason
 
 
 def test_the_ground_station_is_watched_only_when_asked() -> None:
-    assert concern(replace(WELL, gcs_t_ns=0), NOW_NS, battery_low=0.2, gcs_timeout_s=None) is None
+    assert vehicle_fault(replace(WELL, gcs_t_ns=0), NOW_NS, battery_low=0.2, gcs_timeout_s=None) is None
 
 
 def test_a_vehicle_never_heard_is_not_healthy() -> None:
-    assert concern(VehicleState(), NOW_NS, 0.2, None) is Reason.EKF_UNHEALTHY
+    assert vehicle_fault(VehicleState(), NOW_NS, 0.2, None) is Reason.EKF_UNHEALTHY

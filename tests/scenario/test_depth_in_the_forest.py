@@ -107,8 +107,8 @@ def test_what_only_the_left_eye_sees_is_told():
     hidden[:, :-1] = right_of[:, 1:] < partner[:, :-1] - 0.5
     hidden |= partner < 0
     near_hidden = cv2.dilate(hidden.astype(np.uint8), np.ones((3, 5), np.uint8)).astype(bool)
-    assert near_hidden[depth.one_eyed].mean() > 0.85
-    assert depth.one_eyed[hidden].mean() > 0.4
+    assert near_hidden[depth.half_occluded].mean() > 0.85
+    assert depth.half_occluded[hidden].mean() > 0.4
 
 
 @pytest.mark.parametrize("baseline_m", [0.1, 0.3])

@@ -9,7 +9,7 @@ import pytest
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.flights.lockstep import FlightPlan, Watchers, fly
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 from morpheyes_daemon.messages.core import Intent, MissionCommand
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import GateOutput, State
@@ -48,7 +48,7 @@ def test_height_is_kept_over_rolling_ground(tmp_path: Path) -> None:
     (tmp_path / "uphill.yaml").write_text(mission, encoding="utf-8")
     heights: list[float] = []
 
-    def attach(daemon: Daemon, stage: Stage) -> None:
+    def attach(daemon: Daemon, stage: SimVehicle) -> None:
         def note(out: GateOutput) -> None:
             if out.state is State.ENGAGED:
                 heights.append(stage.truth(out.t_ns).height_m)
@@ -73,7 +73,7 @@ def test_the_goal_is_reached_against_the_sun_and_through_undergrowth(world: str)
 def test_a_mixed_course_is_flown_around_its_wall() -> None:
     crossings_m: list[float] = []
 
-    def attach(daemon: Daemon, stage: Stage) -> None:
+    def attach(daemon: Daemon, stage: SimVehicle) -> None:
         def note(out: GateOutput) -> None:
             north_m, east_m, _ = stage.truth(out.t_ns).p_ned_m
             if abs(north_m - 45.0) < 0.1:

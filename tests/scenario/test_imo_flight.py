@@ -9,7 +9,7 @@ from morpheyes_daemon.campaigns.imo_metrics import ImoMeasures
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.flights.lockstep import Summary, Watchers, fly
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 from morpheyes_daemon.messages.core import Track
 
 WORLD = """
@@ -45,7 +45,7 @@ def flown(
     tracks: list[Track] = []
     places: list[np.ndarray] = []
 
-    def attach(daemon: Daemon, stage: Stage) -> None:
+    def attach(daemon: Daemon, stage: SimVehicle) -> None:
         daemon.topics.track.tap(tracks.append)
         daemon.topics.frame.tap(lambda frame: places.append(np.array(stage.truth(frame.t_ns).p_ned_m)))
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from morpheyes_daemon.clock import S, run_virtual, running_clock
 from morpheyes_daemon.flights.flight_plan import make_plan
-from morpheyes_daemon.flights.render_cache import SharedStage
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.render_cache import CachedVehicle
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 
 
 def test_what_is_kept_is_what_would_be_rendered(tmp_path: Path) -> None:
@@ -22,8 +22,8 @@ def test_what_is_kept_is_what_would_be_rendered(tmp_path: Path) -> None:
 
     async def live() -> None:
         clock = running_clock()
-        shared = SharedStage(plan.scenario, plan.config, clock, tmp_path)
-        plain = Stage(plan.scenario, plan.config, clock)
+        shared = CachedVehicle(plan.scenario, plan.config, clock, tmp_path)
+        plain = SimVehicle(plan.scenario, plan.config, clock)
         twins = [asyncio.create_task(stage.autopilot.run()) for stage in (shared, plain)]
         await clock.sleep_until_ns(clock.now_ns() + S)
         for twin in twins:

@@ -1,4 +1,4 @@
-"""The velocity loop through hub and link on the autopilot twin: steps and a stop, judged by the truth."""
+"""The velocity loop through connection and link on the autopilot twin: steps and a stop, judged by the truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from morpheyes_daemon.devices.link import MemoryLink
 from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.crew.scripted import GroundCrew
 from morpheyes_daemon.wire.mavlink import ChannelOverride
-from tests.support.hub_bench import HubBench
+from tests.support.connection_bench import ConnectionBench
 
 HEIGHT_M = 2.4
 ESTIMATOR_M_S = 0.1
@@ -26,11 +26,11 @@ FLOW = {**RECOMMENDED, **FLOW_SETUP}
 class Flight:
     """The bench in the air, and the true speed along north at every stick period."""
 
-    def __init__(self, bench: HubBench) -> None:
+    def __init__(self, bench: ConnectionBench) -> None:
         self.bench = bench
         self.track: list[tuple[float, float]] = []
-        self.output = bench.hub.claim_stick_output()
-        self.model = LoiterModel.from_parameters(bench.hub.parameters.values)
+        self.output = bench.connection.claim_stick_output()
+        self.model = LoiterModel.from_parameters(bench.connection.parameters.values)
         self.controller = VelocityController(self.model)
 
     async def fly(self, seconds: float, north_m_s: float) -> list[float]:
@@ -50,7 +50,7 @@ class Flight:
         return speeds
 
 
-async def take_off(bench: HubBench) -> Flight:
+async def take_off(bench: ConnectionBench) -> Flight:
     near, far = MemoryLink.pair(0.0)
     crew = GroundCrew(bench.twin.radio, near, bench.clock, without_gps=bench.twin.parameters.flow_only)
     near.on_bytes = crew.on_bytes
@@ -78,7 +78,7 @@ def overshoot(speeds: list[float], before: float, after: float) -> float:
 @pytest.mark.parametrize("parameters", [GPS, FLOW], ids=["gps", "flow"])
 def test_steps_up_and_down_and_the_stop(parameters: dict[str, float]) -> None:
     async def story() -> None:
-        async with HubBench(parameters) as bench:
+        async with ConnectionBench(parameters) as bench:
             flight = await take_off(bench)
             up = await flight.fly(4.0, 2.9)
             down = await flight.fly(3.0, 1.0)
@@ -102,7 +102,7 @@ def test_steps_up_and_down_and_the_stop(parameters: dict[str, float]) -> None:
 
 def test_speed_of_the_governor_stops_within_the_distance() -> None:
     async def story() -> None:
-        async with HubBench(GPS) as bench:
+        async with ConnectionBench(GPS) as bench:
             flight = await take_off(bench)
             speed = flight.model.speed_for_distance_m(1.5, HEIGHT_M, reaction_s=0.1)
             await flight.fly(4.0, speed)

@@ -1,6 +1,6 @@
-"""What a guardian is driven with in tests: `Actor` does one thing at a time, `Cockpit` whole stick periods.
+"""What a monitor is driven with in tests: `Actor` does one thing at a time, `Cockpit` whole stick periods.
 
-Both tell the witness the same as the guardian, so that every test of the guardian also checks the rules.
+Both tell the witness the same as the monitor, so that every test of the monitor also checks the rules.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, GateOutput, State
 from morpheyes_daemon.safety.gate import Gate, StickLimits
 from morpheyes_daemon.safety.leases import Lease
-from morpheyes_daemon.safety.monitor import Guardian, GuardianLimits
+from morpheyes_daemon.safety.monitor import SafetyMonitor, SafetyMonitorLimits
 from morpheyes_daemon.safety.states import Transition
-from tests.safety.guardian_witness import Witness
+from tests.safety.monitor_witness import Witness
 
 LIMITS = StickLimits((1000, 1010, 1020, 1000), (2000, 1990, 1980, 2000), (1500, 1490, 1500, 1510))
 OTHER_LIMITS = StickLimits((1100, 1100, 1100, 1100), (1900, 1900, 1900, 1900), (1480, 1520, 1500, 1500), 2500.0)
@@ -25,16 +25,16 @@ OFF_US, ON_US = 1000, 1900
 
 
 class Actor:
-    """A guardian, its gate, the witness and the time; every method does one thing to both."""
+    """A monitor, its gate, the witness and the time; every method does one thing to both."""
 
-    def __init__(self, limits: GuardianLimits | None = None, now_ns: int = 1000 * S) -> None:
-        self.limits = limits or GuardianLimits()
+    def __init__(self, limits: SafetyMonitorLimits | None = None, now_ns: int = 1000 * S) -> None:
+        self.limits = limits or SafetyMonitorLimits()
         self.now_ns = now_ns
         self.said: dict[str, Any] = {}
         self.sent: list[GateOutput] = []
         self.transitions: list[Transition] = []
         self.witness = Witness(self.limits)
-        self.guardian = Guardian(Gate(self._output), self.limits, self.transitions.append)
+        self.monitor = SafetyMonitor(Gate(self._output), self.limits, self.transitions.append)
 
     def _output(self, out: GateOutput) -> None:
         self.witness.check(out)
@@ -42,7 +42,7 @@ class Actor:
 
     @property
     def state(self) -> State:
-        return self.guardian.state
+        return self.monitor.state
 
     def wait(self, dt_ns: int) -> None:
         self.now_ns += dt_ns
@@ -53,7 +53,7 @@ class Actor:
         vehicle = VehicleState(**self.said)
         held, count = self.witness.held is not None, len(self.sent)
         taken_over = self.witness.hear(vehicle)
-        self.guardian.on_vehicle(vehicle, self.now_ns)
+        self.monitor.on_vehicle(vehicle, self.now_ns)
         if taken_over and held:
             assert [out.action for out in self.sent[count:]] == [Action.RELEASE], "not released on reception"
             assert self.witness.held is None
@@ -70,11 +70,11 @@ class Actor:
 
     def renew(self, lease: Lease, for_ns: int) -> None:
         self.witness.lease(lease, self.now_ns + for_ns)
-        self.guardian.gate.renew(lease, self.now_ns + for_ns)
+        self.monitor.gate.renew(lease, self.now_ns + for_ns)
 
     def revoke(self, lease: Lease) -> None:
         self.witness.revoke(lease)
-        self.guardian.gate.revoke(lease)
+        self.monitor.gate.revoke(lease)
 
     def offer(self, widths: tuple[float, float, float, float], for_ns: int = 100 * MS) -> None:
         sticks = Sticks(self.now_ns, self.now_ns + for_ns, *widths)  # type: ignore[arg-type]
@@ -82,37 +82,37 @@ class Actor:
             self.witness.offer = sticks
         else:
             self.witness.offer = None
-        self.guardian.gate.offer(sticks)
+        self.monitor.gate.offer(sticks)
 
     def set_limits(self, limits: StickLimits) -> None:
         self.witness.sticks = limits
-        self.guardian.gate.set_limits(limits)
+        self.monitor.gate.set_limits(limits)
 
     def set_missing(self, reason: Reason | None) -> None:
         self.witness.missing = reason
-        self.guardian.set_missing(reason)
+        self.monitor.set_missing(reason)
 
     def fault(self, reason: Reason, source: str = "") -> None:
         self.witness.faults.add((reason, source))
         self.witness.grounded = True
-        self.guardian.fault(reason, self.now_ns, source)
+        self.monitor.fault(reason, self.now_ns, source)
 
     def clear(self, reason: Reason, source: str = "") -> None:
         self.witness.faults.discard((reason, source))
-        self.guardian.clear(reason, self.now_ns, source)
+        self.monitor.clear(reason, self.now_ns, source)
 
     def mission_over(self, reason: Reason) -> None:
         self.witness.grounded = True
-        self.guardian.mission_over(reason, self.now_ns)
+        self.monitor.mission_over(reason, self.now_ns)
 
     def shutdown(self) -> None:
         self.witness.grounded = self.witness.leaving = True
-        self.guardian.shutdown(self.now_ns)
+        self.monitor.shutdown(self.now_ns)
 
     def release_now(self, reason: Reason) -> None:
         self.witness.grounded = self.witness.leaving = True
         count = len(self.sent)
-        out = self.guardian.release_now(reason, self.now_ns)
+        out = self.monitor.release_now(reason, self.now_ns)
         assert out.action is Action.RELEASE
         assert self.sent[count:]
         assert all(sent.action is Action.RELEASE for sent in self.sent[count:]), "release always passes"
@@ -120,7 +120,7 @@ class Actor:
     def step(self) -> GateOutput:
         self.witness.begin_step(self.now_ns)
         count = len(self.sent)
-        out = self.guardian.step(self.now_ns)
+        out = self.monitor.step(self.now_ns)
         assert out.action is Action.SILENT or self.sent[-1] is out
         assert out.action is not Action.SILENT or all(o.action is Action.RELEASE for o in self.sent[count:])
         if self.state is State.HOLD:
@@ -134,7 +134,7 @@ class Cockpit(Actor):
     PERIOD_NS = 20 * MS
     LEASE_NS = 300 * MS
 
-    def __init__(self, limits: GuardianLimits | None = None) -> None:
+    def __init__(self, limits: SafetyMonitorLimits | None = None) -> None:
         super().__init__(limits)
         self.switch_us: float = OFF_US
         self.silent: set[Lease] = set()
@@ -165,11 +165,11 @@ class Cockpit(Actor):
         """Get ready in the air, having seen the vehicle on the ground."""
         self.set_limits(LIMITS)
         self.set_missing(None)
-        self.guardian.boot_done(self.now_ns)
+        self.monitor.boot_done(self.now_ns)
         self.heartbeat(armed=False, landed=True)
         self.heartbeat(armed=True, landed=False)
         self.run(0.3)
-        assert self.state is State.STANDBY, self.guardian.reason
+        assert self.state is State.STANDBY, self.monitor.reason
         return self
 
     def engage(self) -> Cockpit:
@@ -178,14 +178,14 @@ class Cockpit(Actor):
             self.stand_by()
         self.switch_us = ON_US
         self.run(0.3)
-        assert self.state is State.ENGAGED, self.guardian.reason
+        assert self.state is State.ENGAGED, self.monitor.reason
         return self
 
     def into(self, state: State) -> Cockpit:
         """Get into any state by ways that happen."""
         ways = {
             State.BOOT: lambda: None,
-            State.PREFLIGHT: lambda: self.guardian.boot_done(self.now_ns),
+            State.PREFLIGHT: lambda: self.monitor.boot_done(self.now_ns),
             State.STANDBY: self.stand_by,
             State.ENGAGED: self.engage,
             State.BRAKING: lambda: (self.engage(), self._lose(Lease.DEPTH, 0.4)),

@@ -64,7 +64,7 @@ def view(
         t_ns=t_ns,
         depth_m=depth,
         near=np.zeros(depth.shape, dtype=np.bool_),
-        one_eyed=np.zeros(depth.shape, dtype=np.bool_),
+        half_occluded=np.zeros(depth.shape, dtype=np.bool_),
         pinhole=PINHOLE,
         T_rig_rect=np.eye(4),
         baseline_m=baseline_m,
@@ -102,9 +102,7 @@ def _plane(eye: np.ndarray, picture: np.ndarray, middle: tuple[float, float, flo
     scale = picture.shape[0] / edge_m
     x = ((u - PINHOLE.cx_px) / PINHOLE.f_px * z + eye[1] - middle[1]) * scale + picture.shape[1] / 2
     y = ((v - PINHOLE.cy_px) / PINHOLE.f_px * z + eye[2] - middle[2]) * scale + picture.shape[0] / 2
-    found = cv2.remap(
-        picture, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderValue=math.nan
-    )
+    found = cv2.remap(picture, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderValue=math.nan)
     inside = (x > 0) & (y > 0) & (x < picture.shape[1] - 1) & (y < picture.shape[0] - 1)
     return np.where(inside, found, np.nan)
 

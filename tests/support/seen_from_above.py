@@ -24,9 +24,7 @@ def empty_profile(t_s: float = 1.0, north_m: float = 0.0, east_m: float = 0.0, y
     bins = yaw_rad + np.linspace(-HALF_VIEW_RAD, HALF_VIEW_RAD, BINS)
     free, no = np.full(BINS, np.inf), np.zeros(BINS, dtype=np.bool_)
     place, empty = (north_m, east_m), np.empty((0, 2))
-    return ObstacleProfile(
-        round(t_s * S), (*place, -1.5), place, bins, free, no, free * np.nan, no, empty, 12.0, 0.5
-    )
+    return ObstacleProfile(round(t_s * S), (*place, -1.5), place, bins, free, no, free * np.nan, no, empty, 12.0, 0.5)
 
 
 def with_points(profile: ObstacleProfile, ned_m: list[tuple[float, float]]) -> ObstacleProfile:

@@ -77,9 +77,7 @@ class SyntheticFlight:
         self.baseline_m += float(np.clip(wanted - self.baseline_m, -0.001, 0.001))
         self._publish_vehicle(t, s, speed, braking)
         self.topics.baseline.publish(BaselineEstimate(t, wanted, self.baseline_m, 0.0015, wanted != self.baseline_m))
-        self.topics.governed.publish(
-            Governed(t, limit, "clear", z_close, 30 * self.baseline_m, speed, wanted_m_s)
-        )
+        self.topics.governed.publish(Governed(t, limit, "clear", z_close, 30 * self.baseline_m, speed, wanted_m_s))
         if i % (STICK_HZ // CAMERA_HZ) == 0:
             self._publish_perception(t, i, z_close, wanted, braking)
 
@@ -89,9 +87,19 @@ class SyntheticFlight:
         yaw = math.atan(slope)
         v = (speed * math.cos(yaw), speed * math.sin(yaw), 0.0)
         self.topics.vehicle.publish(
-            VehicleState(t_ns=t, attitude_t_ns=t, pitch_rad=-0.05 * speed, yaw_rad=yaw, position_t_ns=t,
-                         p_ned_m=(self.x_m, y, -1.5), v_ned_m_s=v, heartbeat_t_ns=t, armed=True, custom_mode=5,
-                         landed=False)
+            VehicleState(
+                t_ns=t,
+                attitude_t_ns=t,
+                pitch_rad=-0.05 * speed,
+                yaw_rad=yaw,
+                position_t_ns=t,
+                p_ned_m=(self.x_m, y, -1.5),
+                v_ned_m_s=v,
+                heartbeat_t_ns=t,
+                armed=True,
+                custom_mode=5,
+                landed=False,
+            )
         )
         pitch = 1500 if braking else round(1500 - 90 * speed)
         yaw_us = round(1500 + 120 * math.sin(s * 1.3))
@@ -103,17 +111,29 @@ class SyntheticFlight:
 
     def _publish_perception(self, t: int, i: int, z_close: float, wanted: float, braking: bool) -> None:
         near = 320 * 0.9 * self.baseline_m / 80
-        summary = DepthSummary(i, t - S // 10, t, self.baseline_m, 0.0015, 370.0, 0.82, 0.25, near, 0.91, 0.01,
-                               z_close, 0.06, "5f1e")
+        summary = DepthSummary(
+            i, t - S // 10, t, self.baseline_m, 0.0015, 370.0, 0.82, 0.25, near, 0.91, 0.01, z_close, 0.06, "5f1e"
+        )
         left, depth = synthetic_images(i) if self.images else (None, None)
         percept = {"points": np.full((40, 3), 0.5)}
-        self.topics.perception.publish(
-            Perception(summary, percept, np.full(72, z_close, np.float32), (), left, depth)
-        )
+        self.topics.perception.publish(Perception(summary, percept, np.full(72, z_close, np.float32), (), left, depth))
         intent = Intent.STOP if braking else Intent.FLY
         self.topics.command.publish(
-            MissionCommand(i, t, t + S // 2, intent, Reason.OBSTACLE_CLOSE if braking else None, (3.0, 0.0, 0.0),
-                           0.0, 1.5, wanted, z_close, t - S // 10, (self.x_m, 0.0, -1.5), z_close)
+            MissionCommand(
+                i,
+                t,
+                t + S // 2,
+                intent,
+                Reason.OBSTACLE_CLOSE if braking else None,
+                (3.0, 0.0, 0.0),
+                0.0,
+                1.5,
+                wanted,
+                z_close,
+                t - S // 10,
+                (self.x_m, 0.0, -1.5),
+                z_close,
+            )
         )
 
 

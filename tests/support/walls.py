@@ -39,7 +39,7 @@ def depth_map(depth_m, near=None):
     none = np.zeros(depth_m.shape, bool)
     return DepthMap(
         seq=1, t_ns=1_000_000_000, depth_m=depth_m.astype(np.float32), near=none if near is None else near,
-        one_eyed=none, pinhole=PINHOLE, T_rig_rect=np.eye(4), baseline_m=BASELINE_M, baseline_sigma_m=1e-4,
+        half_occluded=none, pinhole=PINHOLE, T_rig_rect=np.eye(4), baseline_m=BASELINE_M, baseline_sigma_m=1e-4,
         sigma_disparity_px=0.25, near_limit_m=0.7, valid_fraction=1.0, ceiling_fraction=0.0, calibration_hash="none",
     )  # fmt: skip
 

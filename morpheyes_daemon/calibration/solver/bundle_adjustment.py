@@ -258,9 +258,7 @@ def _moved(state: RigState, d_shared: Array, d_own: Array) -> RigState:
     )
 
 
-def _solution(
-    observations: Observations, system: _System, state: RigState, prior: Prior, sigma_px: float
-) -> Solution:
+def _solution(observations: Observations, system: _System, state: RigState, prior: Prior, sigma_px: float) -> Solution:
     reduced, _ = _reduce(system, system.shared + prior.information, system.shared_gradient, system.own)
     scale = 1.0 / np.sqrt(np.diag(reduced))
     covariance = np.linalg.inv(reduced * np.outer(scale, scale)) * np.outer(scale, scale)

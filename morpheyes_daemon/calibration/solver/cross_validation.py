@@ -116,9 +116,7 @@ def _left_out(calibration: Calibration, index: int, full_median_px: float) -> Le
     )
 
 
-def _row_errors(
-    calibration: Calibration, views: NDArray[np.bool_], geometry: StereoGeometry
-) -> tuple[Array, Array]:
+def _row_errors(calibration: Calibration, views: NDArray[np.bool_], geometry: StereoGeometry) -> tuple[Array, Array]:
     """Return the row error (n,) and left pixel (n, 2) of all corners that both eyes saw in the chosen views."""
     left = calibration.observations.left[views].reshape(-1, 2)
     right = calibration.observations.right[views].reshape(-1, 2)

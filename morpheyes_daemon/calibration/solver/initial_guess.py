@@ -75,9 +75,7 @@ def _camera(observations: Observations, eye: int) -> CameraIntrinsics:
     return camera
 
 
-def _opencv(
-    observations: Observations, pixels: Array, views: NDArray[np.intp]
-) -> tuple[CameraIntrinsics, Array]:
+def _opencv(observations: Observations, pixels: Array, views: NDArray[np.intp]) -> tuple[CameraIntrinsics, Array]:
     seen = [np.isfinite(pixels[view, :, 0]) for view in views]
     points = [observations.board.points_m[mask].astype(np.float32) for mask in seen]
     corners = [pixels[view][mask].astype(np.float32) for view, mask in zip(views, seen, strict=True)]
@@ -108,5 +106,3 @@ def _between(
 
 def _pose_of(vector: Array) -> Array:
     return pose(R_from_rotvec(vector[:3]), vector[3:])
-
-

@@ -65,7 +65,7 @@ def find_outliers(observations: Observations, solution: Solution) -> list[Outlie
     return outliers
 
 
-def without_strays(observations: Observations, solution: Solution) -> tuple[Observations, int]:
+def reject_outliers(observations: Observations, solution: Solution) -> tuple[Observations, int]:
     """Return the observations without single corners that were drawn elsewhere, and how many those were.
 
     A picture with many of them, or with several off by half a square, was misread and is left as it is.

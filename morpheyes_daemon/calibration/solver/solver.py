@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from morpheyes_daemon.calibration.solver import bundle_adjustment as bundle
 from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE, Prior, RigState, Solution
 from morpheyes_daemon.calibration.solver.initial_guess import first_guess
-from morpheyes_daemon.calibration.solver.outliers import Outlier, find_outliers, without, without_strays
+from morpheyes_daemon.calibration.solver.outliers import Outlier, find_outliers, reject_outliers, without
 from morpheyes_daemon.calibration.solver.rail_model import Rail, fit_rail, with_rail
 from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
@@ -141,7 +141,7 @@ def _robust(
     named: list[Outlier] = []
     strays = 0
     for _ in range(_OUTLIER_ROUNDS):
-        observations, more = without_strays(observations, solution)
+        observations, more = reject_outliers(observations, solution)
         if more:
             solution = bundle.solve(observations, solution.state, prior, solution.sigma_px)
         found = find_outliers(observations, solution)

@@ -71,7 +71,7 @@ class CaptureGuide:
         return count_cells(np.array(pixels), self.size) if pixels else np.zeros(CELLS[::-1], dtype=np.int64)
 
     def consider(self, left: Image, right: Image) -> Hint:
-        """Judge one raw pair."""
+        """Referee one raw pair."""
         seen_left, seen_right = find_corners(left, self.board), find_corners(right, self.board)
         if seen_left is None or seen_right is None:
             self._last = None

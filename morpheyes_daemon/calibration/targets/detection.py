@@ -92,9 +92,7 @@ class _View:
         return self.left is not None or self.right is not None
 
 
-def _detect(
-    jobs: list[tuple[int, PairFiles]], board: Board, cache: CornerCache, progress: Progress
-) -> Iterator[_View]:
+def _detect(jobs: list[tuple[int, PairFiles]], board: Board, cache: CornerCache, progress: Progress) -> Iterator[_View]:
     """Yield the views in order; two threads, since OpenCV leaves the interpreter while it looks."""
     with ThreadPoolExecutor(max_workers=os.cpu_count() or 1) as pool:
         for done, view in enumerate(pool.map(lambda job: _see(job[0], job[1], board, cache), jobs), start=1):
@@ -217,7 +215,5 @@ def _assembled(
 
 
 def _names(view: _View, root: Path) -> tuple[str, str]:
-    left, right = (
-        str(path.relative_to(root)) if path is not None else "" for path in (view.pair.left, view.pair.right)
-    )
+    left, right = (str(path.relative_to(root)) if path is not None else "" for path in (view.pair.left, view.pair.right))
     return (f"{left} (left half)", f"{right} (right half)") if view.pair.side_by_side else (left, right)

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from morpheyes_daemon.rig_capture.board_capture import Scene
 
 
-
 def capture(
     out: Annotated[Path, typer.Argument(help="Folder for the pictures; goes on where it stopped.")],
     config: ConfigOption = None,
@@ -59,7 +58,7 @@ def capture(
     from morpheyes_daemon.devices.link import open_link
     from morpheyes_daemon.rig_capture.board_capture import capture_boards, capture_visits
     from morpheyes_daemon.rig_capture.mount_capture import HandHeldVehicle, capture_mount
-    from morpheyes_daemon.rig_capture.rig_session import RigStand
+    from morpheyes_daemon.rig_capture.rig_session import RigSession
 
     vehicle = load_config(config)
     known = read_board_file(out) if out.is_dir() else {}
@@ -69,12 +68,10 @@ def capture(
 
     async def session() -> dict[str, int]:
         clock = running_clock()
-        async with RigStand.of(vehicle, clock, open_link) as stand:
+        async with RigSession.of(vehicle, clock, open_link) as stand:
             if mount:
                 async with HandHeldVehicle(vehicle, clock, open_link) as held:
-                    kept = await capture_mount(
-                        stand, lambda: held.state, clock, out, chosen, views or MOUNT_VIEWS, _say
-                    )
+                    kept = await capture_mount(stand, lambda: held.state, clock, out, chosen, views or MOUNT_VIEWS, _say)
                 return {out.name: kept}
             if visits:
                 return await capture_visits(stand, out, chosen, nominal_m, visits, _show)
@@ -192,11 +189,11 @@ def _check_live(rig: Any, config: VehicleConfig, frames: int, progress: Any) -> 
     from morpheyes_daemon.clock import running_clock
     from morpheyes_daemon.devices.link import open_link
     from morpheyes_daemon.perception.calibration_check import RigCheck
-    from morpheyes_daemon.rig_capture.rig_session import RigStand
+    from morpheyes_daemon.rig_capture.rig_session import RigSession
 
     async def session() -> RigCheck:
         check = RigCheck(rig, (config.camera.width_px, config.camera.height_px))
-        async with RigStand.of(config, running_clock(), open_link) as stand:
+        async with RigSession.of(config, running_clock(), open_link) as stand:
             low_m, high_m = rig.range_m
             places = [low_m] if low_m == high_m else [low_m, (low_m + high_m) / 2, high_m]
             for index, place_m in enumerate(places):

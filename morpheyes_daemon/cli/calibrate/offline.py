@@ -182,12 +182,6 @@ def evaluate(
         typer.echo(f"{name}: " + ", ".join(f"{key} {value}" for key, value in row.items()))
 
 
-
-
-
-
-
-
 def _print_solved(solved: Solved, out: Path) -> None:
     calibration = solved.calibration
     rows = []

@@ -39,9 +39,7 @@ class CommandClient:
             self._waiting = command, answers
             try:
                 for confirmation in range(TRIES):
-                    self._send(
-                        dialect.MAVLink_command_long_message(self._target, 1, command, confirmation, *padded)
-                    )
+                    self._send(dialect.MAVLink_command_long_message(self._target, 1, command, confirmation, *padded))
                     result = await _result(answers)
                     if result is not None:
                         _raise_unless_accepted(command, result)

@@ -2,7 +2,7 @@
 
 What arrives is handled on the spot, in the call that brings the bytes: the vehicle's state is published and every
 listener has heard of a mode change before the next byte is looked at. What must wait (parameters, rates,
-reconnecting) runs in `run`. Nothing is decided here: the hub reports, the gate decides.
+reconnecting) runs in `run`. Nothing is decided here: the connection reports, the gate decides.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.config.yaml_errors import read_text
 from morpheyes_daemon.devices.autopilot.commands import CommandClient
 from morpheyes_daemon.devices.autopilot.message_intervals import STREAMS, request_streams
-from morpheyes_daemon.devices.autopilot.override_echo import EchoWatch
+from morpheyes_daemon.devices.autopilot.override_echo import OverrideEcho
 from morpheyes_daemon.devices.autopilot.parameters import ParameterClient
 from morpheyes_daemon.devices.autopilot.telemetry import Telemetry
 from morpheyes_daemon.devices.autopilot.transmitter import Transmitter, may_relay
@@ -50,7 +50,7 @@ STREAM_GONE_NS = 2 * S
 AUTOPILOT_COMPONENT = 1
 
 
-class AutopilotHub:
+class AutopilotConnection:
     """See the module's text. `run` is the task; the rest may be called from the same loop at any time."""
 
     def __init__(
@@ -71,7 +71,7 @@ class AutopilotHub:
         self._decoder = Decoder(signing)
         self._relayed = Decoder()
         self._telemetry = Telemetry()
-        self._echo = EchoWatch()
+        self._echo = OverrideEcho()
         self._echo_lost = False
         self.transmitter = Transmitter(config, signing)
         self.parameters = ParameterClient(self.transmitter.send_status, clock, config.vehicle_sysid)
@@ -141,9 +141,7 @@ class AutopilotHub:
 
     def send_named_int(self, name: str, value: int) -> None:
         """Put a whole number into the autopilot's log under a name of up to ten characters."""
-        self.transmitter.send_status(
-            dialect.MAVLink_named_value_int_message(self._boot_ms(), name.encode()[:10], value)
-        )
+        self.transmitter.send_status(dialect.MAVLink_named_value_int_message(self._boot_ms(), name.encode()[:10], value))
 
     def send_debug_vector(self, name: str, x: float, y: float, z: float) -> None:
         """Show three values under a name of up to ten characters on ground stations; the autopilot acts on none."""

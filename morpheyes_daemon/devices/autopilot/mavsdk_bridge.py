@@ -1,7 +1,7 @@
-"""mavsdk beside the hub: health, battery, texts and actions for doctor, dashboard and ground crews.
+"""mavsdk beside the connection: health, battery, texts and actions for doctor, dashboard and ground crews.
 
-mavsdk gets the frames that the hub received over its `raw://` connection, and what it wants to send goes back
-through the hub, which filters, numbers and signs it; mavsdk opens no port. It runs threads of its own, so it has no
+mavsdk gets the frames that the connection received over its `raw://` connection, and what it wants to send goes back
+through the connection, which filters, numbers and signs it; mavsdk opens no port. It runs threads of its own, so it has no
 place in lockstep, and nothing that keeps the vehicle safe or steers it depends on it: its flight mode reads Loiter,
 Brake and FlowHold all as HOLD, and its `hold()` sends BRAKE.
 """
@@ -16,7 +16,7 @@ from typing import Any
 
 from morpheyes_daemon.clock import Clock
 from morpheyes_daemon.config.vehicle import AutopilotConfig
-from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
 from morpheyes_daemon.errors import DeviceError
 
 MAVSDK_COMPONENT = 191
@@ -39,8 +39,8 @@ class Received:
 class MavsdkBridge:
     """`run` is its task; `latest` holds what mavsdk says by name, `action` its commands once the vehicle is seen."""
 
-    def __init__(self, hub: AutopilotHub, config: AutopilotConfig, clock: Clock) -> None:
-        self._hub = hub
+    def __init__(self, connection: AutopilotConnection, config: AutopilotConfig, clock: Clock) -> None:
+        self._hub = connection
         self._config = config
         self._clock = clock
         self.latest: dict[str, Received] = {}

@@ -1,6 +1,6 @@
 """Which messages we need how often. ArduPilot streams nothing unasked but heartbeats and texts.
 
-SET_MESSAGE_INTERVAL is met per link and forgotten on reboot; the hub asks again after either.
+SET_MESSAGE_INTERVAL is met per link and forgotten on reboot; the connection asks again after either.
 """
 
 from __future__ import annotations
@@ -39,9 +39,7 @@ async def request_streams(commands: CommandClient) -> list[str]:
     refused = []
     for stream in STREAMS:
         try:
-            await commands.send(
-                dialect.MAV_CMD_SET_MESSAGE_INTERVAL, float(stream.number), round(1e6 / stream.rate_hz)
-            )
+            await commands.send(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, float(stream.number), round(1e6 / stream.rate_hz))
         except DeviceTimeoutError:
             raise
         except DeviceError as error:

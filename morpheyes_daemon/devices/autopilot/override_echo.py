@@ -18,7 +18,7 @@ STEADY_NS = S // 2
 Widths = tuple[int, int, int, int]
 
 
-class EchoWatch:
+class OverrideEcho:
     """`sent` and `seen` feed it; `ignored` is true while a steady stream of overrides is not echoed."""
 
     def __init__(self) -> None:

@@ -29,7 +29,7 @@ RELAY_REFUSES = STICK_MESSAGES | {"HEARTBEAT", "TIMESYNC", "PING"}
 
 
 def may_relay(message: Message) -> bool:
-    """Return whether a message of mavsdk may go out; message rates are the hub's alone."""
+    """Return whether a message of mavsdk may go out; message rates are the connection's alone."""
     kind = message.get_type()
     if kind in ("COMMAND_LONG", "COMMAND_INT"):
         return bool(message.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL)

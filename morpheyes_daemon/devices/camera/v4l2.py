@@ -49,9 +49,7 @@ def open_capture(device: str) -> Capture:
 class V4l2Camera:
     """A `Camera` over a V4L2 device; `opener` is for another source of the same shape."""
 
-    def __init__(
-        self, config: V4l2CameraConfig, clock: Clock, opener: Callable[[str], Capture] = open_capture
-    ) -> None:
+    def __init__(self, config: V4l2CameraConfig, clock: Clock, opener: Callable[[str], Capture] = open_capture) -> None:
         self._config, self._clock, self._opener = config, clock, opener
         self._patience_s = max(SHORTEST_PATIENCE_S, PATIENCE_PERIODS / config.rate_hz)
         self._newest = NewestPair()

@@ -33,8 +33,9 @@ def draw_closeups(
         _draw(panel, track, scene, footprint, i)
         letter = "abcdef"[n]
         room = f"{1e2 * clearance_m:.0f} cm" if clearance_m > 0 else "touched"
-        panel.text(0.03, 0.95, f"{letter}   {room}", transform=panel.transAxes, va="top", fontsize=9, bbox=PLATE,
-                   zorder=9)
+        panel.text(
+            0.03, 0.95, f"{letter}   {room}", transform=panel.transAxes, va="top", fontsize=9, bbox=PLATE, zorder=9
+        )
         _letter(axes, track, scene, i, letter)
     if passes:
         text = "closest passes: outline to trunk"
@@ -86,5 +87,14 @@ def _letter(axes: Any, track: Track, scene: Scene, i: int, letter: str) -> None:
     discs = scene.disc_array()
     nearest = discs[np.argmin(np.hypot(discs[:, 0] - x, discs[:, 1] - y) - discs[:, 2])]
     up = 14 if nearest[1] > y else -14
-    axes.annotate(letter, (x, y), xytext=(0, up), textcoords="offset points", ha="center", va="center", fontsize=9,
-                  bbox=CIRCLE, zorder=9)
+    axes.annotate(
+        letter,
+        (x, y),
+        xytext=(0, up),
+        textcoords="offset points",
+        ha="center",
+        va="center",
+        fontsize=9,
+        bbox=CIRCLE,
+        zorder=9,
+    )

@@ -155,5 +155,12 @@ def _draw_legend(figure: Any, axes: Any, lower_in: float) -> None:
     w, h = figure.get_size_inches()
     if axes.get_legend_handles_labels()[0]:
         beside = ((LEFT_IN - 0.1) / w, (lower_in - 1.05) / h) if lower_in > 1 else (0.45, (lower_in - 0.45) / h)
-        figure.legend(loc="center left", bbox_to_anchor=beside, ncol=4, fontsize=9, frameon=False, handletextpad=0.2,
-                      columnspacing=1.2)
+        figure.legend(
+            loc="center left",
+            bbox_to_anchor=beside,
+            ncol=4,
+            fontsize=9,
+            frameon=False,
+            handletextpad=0.2,
+            columnspacing=1.2,
+        )

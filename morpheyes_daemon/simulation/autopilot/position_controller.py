@@ -20,7 +20,6 @@ BRAKE_GAIN_1_S = 1.06
 """AC_Loiter takes half of PSC_VELXY_P, 1.0; recorded brakes fit best with this."""
 
 
-
 @dataclass(frozen=True, slots=True)
 class LoiterLaw:
     """The parameters of Loiter in SI units (LOIT_SPEED, LOIT_ANG_MAX, LOIT_BRK_*)."""
@@ -42,8 +41,6 @@ def square_root_gain(error: float, gain: float, limit: float) -> float:
     if size <= linear:
         return gain * error
     return math.copysign(math.sqrt(2.0 * limit * (size - 0.5 * linear)), error)
-
-
 
 
 class Reference:

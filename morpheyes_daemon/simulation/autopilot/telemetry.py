@@ -196,9 +196,7 @@ def _vfr_hud(autopilot: Autopilot) -> Message:
     speed = math.hypot(e.v_ned_m_s[0], e.v_ned_m_s[1])
     heading = round(math.degrees(e.yaw_rad)) % 360
     throttle = 40 if autopilot.armed and not autopilot.control.landed else 0
-    return mavlink.MAVLink_vfr_hud_message(
-        speed, speed, heading, throttle, HOME_ALT_M - e.p_ned_m[2], -e.v_ned_m_s[2]
-    )
+    return mavlink.MAVLink_vfr_hud_message(speed, speed, heading, throttle, HOME_ALT_M - e.p_ned_m[2], -e.v_ned_m_s[2])
 
 
 def _autopilot_version(autopilot: Autopilot) -> Message:

@@ -19,9 +19,7 @@ from morpheyes_daemon.wire.frames import TcpAddress, encode_pair, parse_address
 class FrameServer:
     """Calls `source` at `rate_hz` and sends what it returns; `dropped` counts pairs a client was too slow for."""
 
-    def __init__(
-        self, address: str, source: Callable[[], Awaitable[RawPair]], clock: Clock, rate_hz: float
-    ) -> None:
+    def __init__(self, address: str, source: Callable[[], Awaitable[RawPair]], clock: Clock, rate_hz: float) -> None:
         self._address, self._source = parse_address(address), source
         self._clock, self._rate_hz = clock, rate_hz
         self._clients: set[asyncio.StreamWriter] = set()

@@ -25,8 +25,6 @@ EXACT_STEPS = 81
 """Baselines in an exact calibration file; between two of them the interpolation errs by less than 1e-4 px."""
 
 
-
-
 @dataclass(frozen=True, slots=True)
 class RigErrors:
     """How badly the twin is built, as one sigma (amplitude for the servo's non-linearity)."""

@@ -57,4 +57,3 @@ def textures_of(materials: Iterable[Material], own: Mapping[str, Texture]) -> di
 @cache
 def _texture(name: str) -> Texture:
     return kept_texture(name, TEXTURES[name])
-

@@ -20,9 +20,7 @@ from morpheyes_daemon.simulation.rendering.jit import allocating, inlined, kerne
 
 NEAR_M = 0.05
 
-SAMPLES: NDArray[np.float64] = np.array(
-    [[0.0, 0.0], [-0.375, -0.125], [0.125, -0.375], [0.375, 0.125], [-0.125, 0.375]]
-)
+SAMPLES: NDArray[np.float64] = np.array([[0.0, 0.0], [-0.375, -0.125], [0.125, -0.375], [0.375, 0.125], [-0.125, 0.375]])
 """Offsets (x, y) in pixels of the samples of a pixel: its centre, then a rotated grid."""
 
 COUNT = len(SAMPLES)

@@ -81,9 +81,7 @@ def _blocks(level: Texels) -> NDArray[np.uint64]:
     return packed.transpose(0, 2, 1, 3).reshape(-1).astype(np.uint64)
 
 
-def noise(
-    rng: np.random.Generator, size: int, stretch: tuple[float, float] = (1.0, 1.0), slope: float = 1.0
-) -> Field:
+def noise(rng: np.random.Generator, size: int, stretch: tuple[float, float] = (1.0, 1.0), slope: float = 1.0) -> Field:
     """Return a periodic (size, size) field with mean 0, sigma 1 and amplitude 1/f**slope.
 
     `stretch` (u, v) lengthens its features along an axis, as bark does.
@@ -147,9 +145,7 @@ def leaves(seed: int, size: int = 512) -> Texture:
     return finished(canvas * light[..., None])
 
 
-def _wrapped_ellipse(
-    canvas: Texels, centre: NDArray[np.int64], axes: tuple[int, int], angle: float, bgr: Field
-) -> None:
+def _wrapped_ellipse(canvas: Texels, centre: NDArray[np.int64], axes: tuple[int, int], angle: float, bgr: Field) -> None:
     size = canvas.shape[0]
     reach = max(axes)
     for dx in (-size, 0, size):

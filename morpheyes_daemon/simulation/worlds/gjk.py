@@ -144,9 +144,7 @@ def _closest_on_tetrahedron(s: Any, weights: Any) -> bool:
 
 
 @allocating
-def _overlap(
-    kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: Any, size_b: Any, directions: Any
-) -> float:
+def _overlap(kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: Any, size_b: Any, directions: Any) -> float:
     """Return the smallest extent of A - B beyond the origin over a fan of directions."""
     best = np.inf
     point = np.empty(3)
@@ -157,9 +155,7 @@ def _overlap(
 
 
 @allocating
-def distance(
-    kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: Any, size_b: Any, directions: Any
-) -> float:
+def distance(kind_a: int, frame_a: Any, size_a: Any, kind_b: int, frame_b: Any, size_b: Any, directions: Any) -> float:
     """Return the signed distance between two solids: kind, frame (3, 4) as rotation and centre, size (9,).
 
     `directions` (n, 3) are unit vectors along which an overlap is measured.

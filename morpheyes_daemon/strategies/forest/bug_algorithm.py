@@ -25,7 +25,7 @@ WIDE_M = 3.0
 """A heading so free is free enough to be followed."""
 
 
-class WayAround:
+class BugAlgorithm:
     """Whether a way around is being flown, and on which side what is in the way is kept: 1 right, -1 left, 0 none."""
 
     def __init__(self) -> None:

@@ -22,7 +22,7 @@ from morpheyes_daemon.messages.core import Intent, MissionCommand, VehicleState
 from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Strategy, StrategyParameters, View
-from morpheyes_daemon.strategies.forest.bug_algorithm import WayAround
+from morpheyes_daemon.strategies.forest.bug_algorithm import BugAlgorithm
 from morpheyes_daemon.strategies.forest.obstacle_memory import ObstacleMemory
 from morpheyes_daemon.strategies.forest.turn_feasibility import MOST_TURN_RAD, homing_m_s, slim_margin_m, turnable_share
 from morpheyes_daemon.strategies.obstacles.corridor import free_distance_m
@@ -114,7 +114,7 @@ class Forest(Strategy):
         self._best_m = math.inf
         self._detour_m = FIRST_DETOUR_M
         self._strayed_m = 0.0
-        self._around = WayAround()
+        self._around = BugAlgorithm()
         self._seq = 0
 
     def perceive(self, view: View) -> ObstacleProfile:

@@ -198,9 +198,7 @@ def _opening(depth: DepthMap, way: Passage, silhouette: Silhouette, hole: _Hole)
     return Opening(contour, z_m, places, safest, *raster.extent_m, beyond_m, hole.cut)
 
 
-def _beyond_m(
-    depth: DepthMap, box: Box, far: Mask, way: Passage, place: Place, silhouette: Silhouette
-) -> float:
+def _beyond_m(depth: DepthMap, box: Box, far: Mask, way: Passage, place: Place, silhouette: Silhouette) -> float:
     """Return how far behind the wall the first thing stands that the vehicle would meet, as far as it is seen.
 
     Only what lies in the tunnel of the silhouette counts: ground and sky behind the wall are passed.

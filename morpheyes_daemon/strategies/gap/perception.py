@@ -71,6 +71,7 @@ def tracked_place(
     `ahead` (3,) is the way through the wall; along it nothing counts unless the range is known. The paper's x_s is a
     place like others where it is as good as the roomiest.
     """
+
     def off(place: Place) -> float:
         apart = np.array(place.p_ned_m) - at_ned_m
         along_m = float(apart @ ahead)

@@ -90,4 +90,3 @@ def disparity_along_row(frame: Frame, uv: Array) -> Array:
         if fit[best] > FITS:
             found[k] = u - half - first - best
     return found
-

@@ -30,7 +30,7 @@ from morpheyes_daemon.strategies.imo.behaviours import (
     pursuit_velocity,
     way_out,
 )
-from morpheyes_daemon.strategies.imo.tracker import Finder
+from morpheyes_daemon.strategies.imo.tracker import ObjectTracker
 from morpheyes_daemon.strategies.obstacles.corridor import free_distance_m
 from morpheyes_daemon.strategies.obstacles.polar_profile import ObstacleProfile, obstacle_profile
 from morpheyes_daemon.transforms import Array, R_from_rpy, wrap_rad
@@ -87,7 +87,7 @@ class Imo(Strategy):
 
     def __init__(self, parameters: ImoParameters, craft: Craft) -> None:
         super().__init__(parameters, craft)
-        self._finder = Finder(parameters.coast_s)
+        self._finder = ObjectTracker(parameters.coast_s)
         self._began_ns = 0
         self._home_ned_m: Array = np.zeros(3)
         self._yaw_rad: float | None = None

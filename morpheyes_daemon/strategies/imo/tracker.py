@@ -90,7 +90,7 @@ class _Candidate:
     places: deque[tuple[int, Array]] = field(default_factory=lambda: deque(maxlen=CHAIN))
 
 
-class Finder:
+class ObjectTracker:
     """One object at a time, as the paper has it; `step` once per frame, in order."""
 
     def __init__(self, coast_s: float = 2.0) -> None:
@@ -115,7 +115,7 @@ class Finder:
         for candidate in self._candidates:
             self._see(candidate, frame, view.depth, dt_s)
         self._adopt(frame, view.depth)
-        self._weed(frame.t_ns)
+        self._prune_tracks(frame.t_ns)
         best = self._candidates[0] if self._candidates else None
         self.tracklets.replenish(frame, best.sighting.mask if best and best.sighting else None)
         if self._before is not None and not (best and best.confirmed):
@@ -246,7 +246,7 @@ class Finder:
         self._candidates.append(candidate)
         return candidate
 
-    def _weed(self, t_ns: int) -> None:
+    def _prune_tracks(self, t_ns: int) -> None:
         """Drop what is gone, what stands still, and what never became a track; the best first."""
         kept = [c for c in self._candidates if self._lives(c, t_ns)]
         kept.sort(key=lambda c: (not c.confirmed, -sum(c.moved), c.born_ns))

@@ -71,7 +71,7 @@ class Movers:
 
 
 @dataclass(slots=True, eq=False)
-class Past:
+class FeatureHistory:
     """A former frame: its time, and the motion since with its covariance."""
 
     t_ns: int
@@ -84,7 +84,7 @@ class Tracklets:
 
     def __init__(self) -> None:
         self._frame: Frame | None = None
-        self._past: deque[Past] = deque(maxlen=CHAIN)
+        self._past: deque[FeatureHistory] = deque(maxlen=CHAIN)
         self.uvd: Array = np.empty((0, 3))
         self._then: Array = np.empty((0, LAGS, 3))
         self.ego: EgoMotion | None = None
@@ -105,7 +105,7 @@ class Tracklets:
             self._remember(before, frame, EgoMotion(told_motion(before, frame), np.eye(6), self.static[:0]))
         return movers
 
-    def since(self, t_ns: int) -> Past | None:
+    def since(self, t_ns: int) -> FeatureHistory | None:
         """Return the vehicle's own motion since the frame of `t_ns`, None when that is forgotten."""
         return next((past for past in self._past if past.t_ns == t_ns), None)
 
@@ -163,7 +163,7 @@ class Tracklets:
         for past in self._past:
             past.T_now_then = ego.T_now_before @ past.T_now_then
             past.covariance = past.covariance + ego.covariance
-        self._past.appendleft(Past(before.t_ns, ego.T_now_before, ego.covariance))
+        self._past.appendleft(FeatureHistory(before.t_ns, ego.T_now_before, ego.covariance))
 
     def _movers(self, now: Frame) -> Movers:
         """Compare with every former frame; the longest comparison that surprises gives the velocity."""

@@ -104,7 +104,7 @@ def obstacle_profile(view: View, band_m: float, trust_m: float, bin_rad: float =
     looked = np.bincount(index[level], minlength=bins)
     matched = np.bincount(index[level & known], minlength=bins)
     too_near = np.bincount(index[level & depth.near[::stride, ::stride].ravel()], minlength=bins)
-    shadowed = np.bincount(index[level & depth.one_eyed[::stride, ::stride].ravel()], minlength=bins)
+    shadowed = np.bincount(index[level & depth.half_occluded[::stride, ::stride].ravel()], minlength=bins)
     near = wide_runs(too_near > 0.4 * np.maximum(looked, 1), NEAR_BINS)
     unknown = (matched < 0.35 * looked) & ~near | (looked == 0)
 

@@ -1,4 +1,4 @@
-"""Valid frames with senseless content from the vehicle itself: the hub lives on and moves no stick."""
+"""Valid frames with senseless content from the vehicle itself: the connection lives on and moves no stick."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.messages.core import VehicleState
-from tests.contract.autopilot.test_autopilot_hub import with_hub
-from tests.support.hub_bench import HubBench
+from tests.contract.autopilot.test_autopilot_connection import with_connection
+from tests.support.connection_bench import ConnectionBench
 
 HEARD = (0, 1, 22, 30, 32, 65, 77, 111, 132, 193, 245, 253)
 FRAMES = 6000
@@ -30,12 +30,12 @@ def frame(number: int, payload: bytes, seq: int) -> bytes:
 def test_senseless_content_raises_nothing_and_moves_nothing(seed: int) -> None:
     states: list[VehicleState] = []
 
-    async def story(bench: HubBench) -> None:
+    async def story(bench: ConnectionBench) -> None:
         await bench.ready()
         chance = np.random.default_rng(seed)
         failures: list[object] = []
         asyncio.get_running_loop().set_exception_handler(lambda loop, context: failures.append(context))
-        bench.hub.on_vehicle(states.append)
+        bench.connection.on_vehicle(states.append)
         every = sorted(mavlink.mavlink_map)
         for i in range(FRAMES):
             number = int(chance.choice(HEARD if i % 2 else every))
@@ -50,7 +50,7 @@ def test_senseless_content_raises_nothing_and_moves_nothing(seed: int) -> None:
         before = len(states)
         await bench.until(lambda: len(states) > before + 20, 10.0)  # the twin is still heard
 
-    with_hub(story)
+    with_connection(story)
     for state in states:
         numbers = (state.roll_rad, state.pitch_rad, state.yaw_rad, *state.p_ned_m, *state.v_ned_m_s)
         assert all(math.isfinite(number) for number in numbers)

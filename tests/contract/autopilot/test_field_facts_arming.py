@@ -33,9 +33,7 @@ def set_origin(bench: AutopilotBench) -> None:
 # Arming
 
 
-@pytest.mark.parametrize(
-    ("throttle_us", "result"), [(1000, ACCEPTED), (985, ACCEPTED), (984, FAILED), (1500, FAILED)]
-)
+@pytest.mark.parametrize(("throttle_us", "result"), [(1000, ACCEPTED), (985, ACCEPTED), (984, FAILED), (1500, FAILED)])
 def test_arming_needs_the_throttle_low_but_not_below_985(throttle_us: int, result: int) -> None:
     bench = ready()
     bench.radio.sticks(throttle_us=throttle_us)

@@ -1,4 +1,4 @@
-"""mavsdk behind the hub: it hears the twin, its commands arrive, and what is the hub's alone is not let out.
+"""mavsdk behind the connection: it hears the twin, its commands arrive, and what is the connection's alone is not let out.
 
 mavsdk runs threads of its own, so these tests run in real time and wait for what they expect.
 """
@@ -15,14 +15,14 @@ from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
 from morpheyes_daemon.wire.mavlink import Encoder, Identity
-from tests.support.hub_bench import HubBench
+from tests.support.connection_bench import ConnectionBench
 
 MAVSDK = Identity(1, 191)
 
 
 async def test_mavsdk_hears_and_commands_through_the_hub() -> None:
-    async with HubBench(delay_s=0.0) as bench:
-        bridge = MavsdkBridge(bench.hub, AutopilotConfig(), bench.clock)
+    async with ConnectionBench(delay_s=0.0) as bench:
+        bridge = MavsdkBridge(bench.connection, AutopilotConfig(), bench.clock)
         running = asyncio.create_task(bridge.run())
         try:
             await bench.ready()
@@ -55,11 +55,11 @@ async def test_mavsdk_hears_and_commands_through_the_hub() -> None:
 )
 def test_what_mavsdk_may_not_send(message: object) -> None:
     async def story() -> None:
-        async with HubBench() as bench:
+        async with ConnectionBench() as bench:
             await bench.ready()
-            bench.hub.relay(Encoder().pack(message, MAVSDK))
-            bench.hub.relay(Encoder().pack(mavlink.MAVLink_ping_message(0, 0, 0, 0), MAVSDK) + b"\xfd garbage")
-            bench.hub.relay(Encoder().pack(mavlink.MAVLink_param_request_list_message(1, 1), MAVSDK))
+            bench.connection.relay(Encoder().pack(message, MAVSDK))
+            bench.connection.relay(Encoder().pack(mavlink.MAVLink_ping_message(0, 0, 0, 0), MAVSDK) + b"\xfd garbage")
+            bench.connection.relay(Encoder().pack(mavlink.MAVLink_param_request_list_message(1, 1), MAVSDK))
             await bench.sleep(0.1)
             from_mavsdk = [m.get_type() for m in bench.sent if m.get_srcComponent() == MAVSDK.compid]
             assert from_mavsdk == ["PARAM_REQUEST_LIST"]

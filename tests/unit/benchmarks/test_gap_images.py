@@ -46,7 +46,9 @@ def test_flow_of_forward_motion_points_away_from_where_one_flies():
 
 
 def test_a_hole_is_found_in_flow_lengths():
-    inverse = np.full((120, 160), 20.0, np.float32) + np.random.default_rng(0).normal(0, 0.3, (120, 160)).astype(np.float32)
+    inverse = np.full((120, 160), 20.0, np.float32) + np.random.default_rng(0).normal(0, 0.3, (120, 160)).astype(
+        np.float32
+    )
     inverse[40:80, 60:110] = 8.0
     hole, separation, bimodal = largest_hole(inverse)
     assert bimodal

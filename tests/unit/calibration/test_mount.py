@@ -18,7 +18,7 @@ from morpheyes_daemon.flights.sim_boards import render_mount_folder
 from morpheyes_daemon.simulation.camera.true_rig import RANGE_M, RigTwin
 from morpheyes_daemon.stereo.calibration_file import calibration_hash, read_calibration, write_calibration
 from morpheyes_daemon.stereo.rectify import rectify
-from morpheyes_daemon.stereo.rig import EyeMount, RigModel
+from morpheyes_daemon.stereo.rig import CameraMount, RigModel
 from morpheyes_daemon.transforms import Array, R_from_rotvec, rotvec_from_R
 
 R_FRD_RIG = T_frd_rig(Mount())[:3, :3]
@@ -41,7 +41,7 @@ def turned(n: int, spread_rad: float, noise_rad: float, stray: int = 0) -> Mount
     return MountViews(tuple(str(k) for k in range(n)), noisy, np.array(seen))
 
 
-def off_rad(mount: EyeMount, true: Array = TRUE) -> float:
+def off_rad(mount: CameraMount, true: Array = TRUE) -> float:
     return float(np.linalg.norm(rotvec_from_R(R_from_rotvec(true).T @ R_from_rotvec(np.array(mount.rotation_rad)))))
 
 
@@ -147,7 +147,7 @@ def test_a_folder_without_attitudes_says_how_to_take_them(tmp_path: Path) -> Non
 
 def test_the_file_keeps_it_and_the_rectified_eye_points_there(tmp_path: Path) -> None:
     rig = RigTwin(640, 480, seed=1).exact_rig(3)
-    mounted = replace(rig, mount=EyeMount((0.009, -0.006, 0.004), (1e-3, 1e-3, 1e-3)))
+    mounted = replace(rig, mount=CameraMount((0.009, -0.006, 0.004), (1e-3, 1e-3, 1e-3)))
     write_calibration(mounted, tmp_path / "rig.yaml")
     read = read_calibration(tmp_path / "rig.yaml")
     assert read.mount is not None

@@ -155,9 +155,7 @@ def test_results_are_replaced_all_or_none_and_while_nobody_else_may_fly_there(
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_a_scheduler_that_does_not_answer_leaves_the_results_alone(
-    campaign: Campaign, sky: Sky, tmp_path: Path
-) -> None:
+def test_a_scheduler_that_does_not_answer_leaves_the_results_alone(campaign: Campaign, sky: Sky, tmp_path: Path) -> None:
     fly(replace(campaign, seeds=(0,)), tmp_path)
     before = contents(tmp_path)
     with pytest.raises(UsageError, match="--scheduler"):

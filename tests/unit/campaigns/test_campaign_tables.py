@@ -76,7 +76,9 @@ def test_baselines_are_compared_by_the_flights_of_the_same_seed() -> None:
     assert "variable faster" not in flight_table(flight_cells(rows[:3], 5.0))
 
 
-@pytest.mark.parametrize(("world", "trees_per_ha"), [("forest_sparse", 100.0), ("forest", 400.0), ("forest_dense", 1000.0), ("mixed", 250.0)])
+@pytest.mark.parametrize(
+    ("world", "trees_per_ha"), [("forest_sparse", 100.0), ("forest", 400.0), ("forest_dense", 1000.0), ("mixed", 250.0)]
+)
 def test_a_table_of_flights_among_trees_says_how_many_and_the_speed_that_was_set(
     world: str, trees_per_ha: float, tmp_path: Path
 ) -> None:

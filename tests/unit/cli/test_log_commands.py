@@ -97,7 +97,10 @@ def test_report_makes_figures_and_pictures(log: Path, terminal: Terminal, tmp_pa
     assert figures["engaged_s"] == pytest.approx(16.0 - 1.2, abs=0.1)
     assert 0.1 <= figures["baseline_min_m"] < figures["baseline_max_m"] <= 0.3
     assert figures["peak_speed_m_s"] == pytest.approx(0.93 * 3.4, abs=0.05)
-    assert figures["held_by"] == {"clear": pytest.approx(13.0 / 14.8, abs=0.01), "mission": pytest.approx(1.8 / 14.8, abs=0.01)}
+    assert figures["held_by"] == {
+        "clear": pytest.approx(13.0 / 14.8, abs=0.01),
+        "mission": pytest.approx(1.8 / 14.8, abs=0.01),
+    }
 
 
 def test_a_scene_comes_back_from_a_header() -> None:

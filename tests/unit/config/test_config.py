@@ -110,7 +110,8 @@ def test_a_height_may_be_prescribed_by_equal_bounds(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("servo", "held_mm", "limits"), [("serial", 400, "100 to 300"), ("serial", 50, "100 to 300"), ("none", 150, "200 to 200")]
+    ("servo", "held_mm", "limits"),
+    [("serial", 400, "100 to 300"), ("serial", 50, "100 to 300"), ("none", 150, "200 to 200")],
 )
 def test_only_a_baseline_that_the_rig_can_take_is_held(servo: str, held_mm: float, limits: str) -> None:
     text = f"camera: {{backend: v4l2}}\nservo: {{backend: {servo}}}\nhold_baseline_mm: {held_mm}\n"

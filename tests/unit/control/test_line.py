@@ -10,7 +10,7 @@ from morpheyes_daemon.control.path_following import (
     CLIMB_MOST_M_S,
     LEAN_LAG_S,
     MISSED_MOST_M_S,
-    LineKeeper,
+    PathFollower,
 )
 from morpheyes_daemon.messages.core import Intent, Line, MissionCommand, VehicleState
 
@@ -25,7 +25,7 @@ def command(line, v=(3.0, 0.0, 0.0)):
 
 
 def wanted_velocity(order, vehicle, now_ns):
-    return LineKeeper().wanted_velocity(order, vehicle, now_ns)
+    return PathFollower().wanted_velocity(order, vehicle, now_ns)
 
 
 def test_without_a_line_the_command_stands():
@@ -63,7 +63,7 @@ def test_a_quick_line_is_climbed_to_no_quicker_than_climbing_answers():
 
 
 def test_what_stays_missing_is_asked_for_more_and_more():
-    keeper, vehicle = LineKeeper(), VehicleState(p_ned_m=(1.0, 0.05, -1.5))
+    keeper, vehicle = PathFollower(), VehicleState(p_ned_m=(1.0, 0.05, -1.5))
     order = command(Line(0, (7.0, 0.0, -1.5), gain_1_s=2.0, integral_1_s2=3.0))
     first, *_, last = (keeper.wanted_velocity(order, vehicle, k * S // 50)[1] for k in range(1, 51))
     assert first == pytest.approx(-0.1)

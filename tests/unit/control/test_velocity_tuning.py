@@ -14,9 +14,7 @@ from tests.support.copter_parameters import copter_parameters
 
 
 def config(**safety: float) -> VehicleConfig:
-    return VehicleConfig(
-        camera=SimCameraConfig(), servo=NoServoConfig(backend="none"), safety=SafetyConfig(**safety)
-    )
+    return VehicleConfig(camera=SimCameraConfig(), servo=NoServoConfig(backend="none"), safety=SafetyConfig(**safety))
 
 
 def test_a_stop_is_neutral_unless_active_braking_is_asked_for() -> None:

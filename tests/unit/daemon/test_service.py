@@ -38,15 +38,18 @@ def test_ready_once_status_at_every_change_watchdog_always() -> None:
     ]
 
 
-@pytest.mark.parametrize(("ages_s", "turns"), [
-    ({}, True),
-    ({"gate": 1.5}, False),
-    ({"gate": math.nan}, False),
-    ({"frame": math.nan, "perception": math.nan}, True),
-    ({"frame": 60.0, "perception": 60.0}, True),
-    ({"perception": 10.0}, True),
-    ({"perception": 31.0}, False),
-])
+@pytest.mark.parametrize(
+    ("ages_s", "turns"),
+    [
+        ({}, True),
+        ({"gate": 1.5}, False),
+        ({"gate": math.nan}, False),
+        ({"frame": math.nan, "perception": math.nan}, True),
+        ({"frame": 60.0, "perception": 60.0}, True),
+        ({"perception": 10.0}, True),
+        ({"perception": 31.0}, False),
+    ],
+)
 def test_only_what_a_restart_could_mend_stops_the_watchdog(ages_s: dict[str, float], turns: bool) -> None:
     assert chain_turns(report(**ages_s)) is turns
     manager = Manager()
@@ -58,5 +61,5 @@ def test_an_event_is_one_line_that_says_its_reason_once() -> None:
     second = 1_000_000_000
     detail = Event(3 * second, "camera", Reason.CAMERA_LOST, "/dev/video0: unplugged")
     assert event_line(detail, second) == "     2.00 s  camera     the camera went away; /dev/video0: unplugged"
-    same = Event(3 * second, "guardian", Reason.READY, f"preflight to standby: {Reason.READY.text}")
+    same = Event(3 * second, "monitor", Reason.READY, f"preflight to standby: {Reason.READY.text}")
     assert event_line(same, second).count(Reason.READY.text) == 1

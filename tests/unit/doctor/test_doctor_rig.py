@@ -29,7 +29,7 @@ from morpheyes_daemon.errors import DeviceNotFoundError, DeviceTimeoutError
 from morpheyes_daemon.messages.core import Image, RawPair
 from morpheyes_daemon.stereo.calibration_file import write_calibration
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
-from morpheyes_daemon.stereo.rig import EyeMount, RigModel
+from morpheyes_daemon.stereo.rig import CameraMount, RigModel
 
 WIDTH, HEIGHT, F_PX, BASELINE_M, DISPARITY_PX = 320, 240, 300.0, 0.1, 12
 
@@ -43,7 +43,7 @@ def rig(method: str = "solved", verdict: str = "fit to fly: rows agree", longest
         poses.append(T)
     return replace(
         RigModel.from_poses(eye, eye, (BASELINE_M, longest_m), poses, method, {"verdict": verdict}),
-        mount=EyeMount((0.0, 0.01, 0.0), (1e-3, 1e-3, 1e-3)),
+        mount=CameraMount((0.0, 0.01, 0.0), (1e-3, 1e-3, 1e-3)),
     )
 
 

@@ -30,7 +30,7 @@ def test_what_was_last_said_of_a_reason_is_kept_but_not_the_guardian_s_own_words
         ("camera", Reason.CAMERA_LOST, "camera: unplugged"),
         ("camera", Reason.RECOVERED, "camera: works again"),
         ("mission", Reason.MISSION_REFUSED, SIZE),
-        ("guardian", Reason.MISSION_REFUSED, "ENGAGED to BRAKING: refused"),
+        ("monitor", Reason.MISSION_REFUSED, "ENGAGED to BRAKING: refused"),
         ("camera", Reason.CAMERA_LOST, "camera: unplugged again"),
     ):
         events.publish(Event(1, source, reason, text))

@@ -5,13 +5,13 @@ import pytest
 from morpheyes_daemon.benchmarks.soak import Sample, judge_soak
 from morpheyes_daemon.bus import Latest
 from morpheyes_daemon.clock import MS
-from morpheyes_daemon.flights.stick_timing import StickBeat
+from morpheyes_daemon.flights.stick_timing import StickTiming
 from morpheyes_daemon.messages.safety import Action, GateOutput, State
 
 
-def beat_of(*outputs: tuple[int, Action]) -> StickBeat:
+def beat_of(*outputs: tuple[int, Action]) -> StickTiming:
     gate: Latest[GateOutput] = Latest("gate")
-    beat = StickBeat(gate, lambda: 0.0)
+    beat = StickTiming(gate, lambda: 0.0)
     for t_ms, action in outputs:
         gate.publish(GateOutput(t_ms * MS, State.ENGAGED, action, None))
     return beat
@@ -30,7 +30,7 @@ def test_only_what_moves_or_holds_a_stick_counts() -> None:
 def test_what_the_machines_host_took_is_told_apart() -> None:
     gate: Latest[GateOutput] = Latest("gate")
     stolen = iter([0.0, 0.0, 0.3, 0.3, 0.31])
-    beat = StickBeat(gate, lambda: next(stolen))
+    beat = StickTiming(gate, lambda: next(stolen))
     for t_ms in (0, 20, 350, 372, 392):
         gate.publish(GateOutput(t_ms * MS, State.ENGAGED, Action.STICKS, None))
     found = beat.intervals()

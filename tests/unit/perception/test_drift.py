@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px
 from morpheyes_daemon.messages.core import BaselineEstimate, Pinhole, StereoFrame
-from morpheyes_daemon.perception.camera_motion import EyeMotion, right_eye_rates, row_rates
-from morpheyes_daemon.perception.extrinsics_monitor import Drift, DriftMonitor, rows_apart_rad, turned_rig
+from morpheyes_daemon.perception.camera_motion import CameraMotion, right_eye_rates, row_rates
+from morpheyes_daemon.perception.extrinsics_monitor import ExtrinsicsFault, ExtrinsicsMonitor, rows_apart_rad, turned_rig
 from morpheyes_daemon.perception.yaw_estimator import leverage
 from morpheyes_daemon.stereo.calibration_file import calibration_hash
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
@@ -62,7 +62,7 @@ def test_turning_back_gives_the_rig_again() -> None:
 def test_rates_of_the_right_eye_are_those_of_moving_the_rig() -> None:
     pinhole, b = Pinhole(640, 480, 740.0, 319.5, 239.5), 0.25
     v, w, dt = np.array([0.4, -0.3, 2.0]), np.array([0.2, -0.3, 0.4]), 1e-6
-    motion = EyeMotion(np.eye(4), v, w)
+    motion = CameraMotion(np.eye(4), v, w)
     points = np.array([[0.3, -0.2, 2.0], [-0.8, 0.5, 4.0], [1.0, 0.2, 8.0]])
     middle = np.array([pinhole.cx_px, pinhole.cy_px])
     uv = points[:, :2] / points[:, 2:] * pinhole.f_px + middle
@@ -82,32 +82,32 @@ WORLD = [Panel(5.0, slope_x=0.3), Panel(2.5, x_m=(-0.3, 0.6), y_m=(-0.5, 0.3), s
 SMALL = crooked_rig(320, 240)
 
 
-def watched(pitch_deg: float, panels: list[Panel], frames: int, moving: bool = False) -> tuple[DriftMonitor, list[Drift]]:
+def watched(
+    pitch_deg: float, panels: list[Panel], frames: int, moving: bool = False
+) -> tuple[ExtrinsicsMonitor, list[ExtrinsicsFault]]:
     """A monitor that has seen the same still pair for so many frames, the right eye having turned since."""
-    monitor = DriftMonitor(turned_rig(SMALL, -np.radians([pitch_deg, 0.0, 0.0]), 0.2))
+    monitor = ExtrinsicsMonitor(turned_rig(SMALL, -np.radians([pitch_deg, 0.0, 0.0]), 0.2))
     estimator = DepthEstimator(monitor.rig)
     at = BaselineEstimate(0, 0.2, 0.2, 1e-4, moving)
     frame = StereoFrame(0, 0, *raw_pair(panels, SMALL, 0.2, noise=1.5), at)
     pair = estimator.rectified(frame)
     depth = estimator.depth(frame, pair)
     offsets = row_offsets(pair.left, pair.right, disparity_of(depth))
-    still = EyeMotion.still(np.eye(4))
+    still = CameraMotion.still(np.eye(4))
     reports = [monitor.update(pair, depth, offsets, moving, still) for _ in range(frames)]
     return monitor, [finding.what for report in reports for finding in report.findings]
 
 
 @pytest.mark.parametrize(("late_ms", "frames", "late"), [(2.0, 9, False), (5.0, 9, False), (7.0, 2, False),
                                                           (7.0, 3, True), (20.0, 3, True)])  # fmt: skip
-def test_eyes_that_expose_far_from_when_they_should_end_trust_in_depth(
-    late_ms: float, frames: int, late: bool
-) -> None:
+def test_eyes_that_expose_far_from_when_they_should_end_trust_in_depth(late_ms: float, frames: int, late: bool) -> None:
     """Declared are 2 ms; the rows are moved as flying ahead at 3 m/s moves them in that time."""
-    monitor = DriftMonitor(SMALL)
+    monitor = ExtrinsicsMonitor(SMALL)
     estimator = DepthEstimator(SMALL)
     frame = StereoFrame(0, 0, *raw_pair(WORLD, SMALL, 0.2, noise=1.5), BaselineEstimate(0, 0.2, 0.2, 1e-4, False))
     pair = estimator.rectified(frame)
     depth = estimator.depth(frame, pair)
-    ahead = EyeMotion(np.eye(4), np.array([0.0, 0.0, 3.0]), np.zeros(3))
+    ahead = CameraMotion(np.eye(4), np.array([0.0, 0.0, 3.0]), np.zeros(3))
     offsets = row_offsets(pair.left, pair.right, disparity_of(depth))
     by_travel, _ = row_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, ahead)
     offsets = replace(offsets, dv_px=offsets.dv_px + late_ms / 1e3 * by_travel)
@@ -118,7 +118,7 @@ def test_eyes_that_expose_far_from_when_they_should_end_trust_in_depth(
 
 def test_a_pitched_eye_is_told_at_once_and_corrected_ten_frames_later() -> None:
     monitor, told = watched(0.15, WORLD, frames=11)
-    assert told == [Drift.ROWS, Drift.TURNED]
+    assert told == [ExtrinsicsFault.ROWS, ExtrinsicsFault.TURNED]
     turned_back = inverse(SMALL.T_cam0_cam1(0.2)) @ monitor.rig.T_cam0_cam1(0.2)
     left_over = np.degrees(Rotation.from_matrix(turned_back[:3, :3]).magnitude())
     assert left_over < 0.02, "a tenth of a pixel"
@@ -137,21 +137,21 @@ def test_nothing_is_done_without_evidence(pitch_deg: float, panels: list[Panel],
 
 def test_nothing_is_corrected_while_the_servo_moves() -> None:
     _, told = watched(0.15, WORLD, frames=15, moving=True)
-    assert Drift.TURNED not in told
+    assert ExtrinsicsFault.TURNED not in told
 
 
 def test_an_eye_that_turned_far_is_broken_and_not_mended() -> None:
     monitor, told = watched(0.3, WORLD, frames=15)
-    assert told == [Drift.ROWS, Drift.BROKEN]
+    assert told == [ExtrinsicsFault.ROWS, ExtrinsicsFault.BROKEN]
     assert monitor.broken
 
 
 def test_a_yaw_too_large_for_a_drift_must_be_seen_by_two_pairs_of_frames() -> None:
     rig = RigModel.from_poses(CAM0, CAM1, TEN_M.tolist(), [true_pose(b) for b in TEN_M])
-    monitor, yaw_rad = DriftMonitor(rig), math.radians(0.5)
+    monitor, yaw_rad = ExtrinsicsMonitor(rig), math.radians(0.5)
     found = {}
     for pairs in (1, 2):
         monitor._yaw = SimpleNamespace(yaw_rad=yaw_rad, sigma_rad=0.02 * yaw_rad, pairs=pairs)  # type: ignore[assignment]
         found[pairs] = [finding.what for finding in monitor._judge_yaw(740.0, 0.2)], monitor.broken
-    assert found == {1: ([Drift.DOUBTED], False), 2: ([Drift.BROKEN], True)}
+    assert found == {1: ([ExtrinsicsFault.DOUBTED], False), 2: ([ExtrinsicsFault.BROKEN], True)}
     assert calibration_hash(monitor.rig) == calibration_hash(rig), "and nothing was corrected"

@@ -7,9 +7,9 @@ import pytest
 
 from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.perception.image_checks import (
-    AlikeCheck,
     FrozenCheck,
     ImageFault,
+    PairCheck,
     exposure_faults,
     matching_faults,
     row_shift,
@@ -125,14 +125,14 @@ def ask(check, left, right, disparity_px):
 
 
 def test_eyes_that_see_the_same_are_alike(pair):
-    check = AlikeCheck()
+    check = PairCheck()
     assert [ask(check, *pair, disparity(*pair)) for _ in range(6)] == [set()] * 6
 
 
 def test_eyes_that_see_different_things_are_told_after_three_frames(pair):
     left, right = pair
     wrong = disparity(left, right) + 12
-    check = AlikeCheck()
+    check = PairCheck()
     assert [ask(check, left, right, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.UNLIKE}] * 2
     assert ask(check, left, right, disparity(left, right)) == {ImageFault.UNLIKE}
     assert ask(check, left, right, disparity(left, right)) == set(), "two good frames clear it"
@@ -141,14 +141,14 @@ def test_eyes_that_see_different_things_are_told_after_three_frames(pair):
 def test_a_row_apart_is_no_fault(pair):
     left, right = pair
     apart = np.roll(right, 1, axis=0)
-    check = AlikeCheck()
+    check = PairCheck()
     assert [ask(check, left, apart, disparity(left, apart)) for _ in range(9)] == [set()] * 9
 
 
 def test_rows_that_stay_apart_are_told_after_five_frames(pair):
     left, right = pair
     apart, wrong, good = np.roll(right, 2, axis=0), disparity(left, right), (left, right, disparity(left, right))
-    check = AlikeCheck()
+    check = PairCheck()
     found = [ask(check, left, apart, wrong) for _ in range(6)]
     assert found == [set()] * 4 + [{ImageFault.APART}] * 2
     assert [ask(check, *good) for _ in range(4)] == [{ImageFault.APART}] * 3 + [set()], "four bad frames of eight"
@@ -157,9 +157,9 @@ def test_rows_that_stay_apart_are_told_after_five_frames(pair):
 def test_few_places_of_which_none_is_found_again_are_told(pair):
     """Swapped eyes in a dense view: hardly a place has a depth at all."""
     nothing = RowOffsets(np.empty((0, 2)), np.empty(0), np.empty(0), tried=45)
-    check = AlikeCheck()
+    check = PairCheck()
     assert [check.check(pair[0], nothing, F_PX) for _ in range(3)] == [set(), set(), {ImageFault.UNLIKE}]
-    check, fewer = AlikeCheck(), replace(nothing, tried=20)
+    check, fewer = PairCheck(), replace(nothing, tried=20)
     assert [check.check(pair[0], fewer, F_PX) for _ in range(4)] == [set()] * 4, "too few to say"
 
 
@@ -167,7 +167,7 @@ def test_few_places_of_which_none_is_found_again_are_told(pair):
 def test_few_places_that_are_found_again_vouch_for_the_eyes_when_their_rows_agree(pair, rows_px, told):
     """All that is seen is far and hazy, or the few partners are false."""
     few = RowOffsets(np.zeros((20, 2)), np.full(20, 3.0), np.full(20, rows_px), tried=90)
-    check = AlikeCheck()
+    check = PairCheck()
     assert [bool(check.check(pair[0], few, F_PX)) for _ in range(4)] == [False, False, told, told]
 
 
@@ -176,7 +176,7 @@ def test_rows_far_apart_are_told_after_three_frames_like_eyes_that_see_different
     left, right = pair
     apart, wrong = np.roll(right, 5, axis=0), disparity(left, right)
     assert row_offsets(left, apart, wrong).count > 0.3 * row_offsets(left, apart, wrong).tried
-    check = AlikeCheck()
+    check = PairCheck()
     assert [ask(check, left, apart, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.UNLIKE}] * 2
 
 
@@ -184,8 +184,11 @@ def test_rows_no_farther_apart_than_the_doubt_in_where_the_eyes_point_are_no_fau
     left, right = pair
     apart = np.roll(right, 2, axis=0)
     offsets = row_offsets(left, apart, disparity(left, apart))
-    kept = {doubt_rad: AlikeCheck() for doubt_rad in (0.0, 1e-3, 4e-3)}
-    found = {doubt_rad: [check.check(left, offsets, F_PX, doubt_rad) for _ in range(6)][-1] for doubt_rad, check in kept.items()}
+    kept = {doubt_rad: PairCheck() for doubt_rad in (0.0, 1e-3, 4e-3)}
+    found = {
+        doubt_rad: [check.check(left, offsets, F_PX, doubt_rad) for _ in range(6)][-1]
+        for doubt_rad, check in kept.items()
+    }
     assert found == {0.0: {ImageFault.APART}, 1e-3: {ImageFault.APART}, 4e-3: set()}
 
 
@@ -193,7 +196,7 @@ def test_rows_apart_for_a_moment_are_no_fault(pair):
     """As in a quick pitch, where 2 ms between the eyes show."""
     left, right = pair
     apart, depth = np.roll(right, 2, axis=0), disparity(left, right)
-    check = AlikeCheck()
+    check = PairCheck()
     for _ in range(3):
         assert [ask(check, left, apart, depth) for _ in range(4)] == [set()] * 4
         assert [ask(check, left, right, depth) for _ in range(8)] == [set()] * 8
@@ -202,4 +205,4 @@ def test_rows_apart_for_a_moment_are_no_fault(pair):
 def test_a_bare_wall_is_no_fault():
     rng = np.random.default_rng(1)
     left, right = (rng.normal(120, 1.0, (240, 320)).round().astype(np.uint8) for _ in range(2))
-    assert ask(AlikeCheck(), left, right, np.full((240, 320), 5.0, np.float32)) == set()
+    assert ask(PairCheck(), left, right, np.full((240, 320), 5.0, np.float32)) == set()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.messages.core import DepthMap, Pinhole
-from morpheyes_daemon.perception.camera_motion import EyeMotion
-from morpheyes_daemon.perception.depth_scale_monitor import ScaleWatch, Sight, scale_between
+from morpheyes_daemon.perception.camera_motion import CameraMotion
+from morpheyes_daemon.perception.depth_scale_monitor import DepthScaleMonitor, Sight, scale_between
 from morpheyes_daemon.transforms import R_from_rotvec, pose
 
 PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)
@@ -40,13 +40,13 @@ def sight(t_s: float, way_m: np.ndarray, turn_rad: np.ndarray, told_turn_rad: np
     image = cv2.remap(TEXTURE, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     depth = along.astype(np.float32)  # along the optical axis, since a ray's third part is 1 in the eye's own axes
     told = R_from_rotvec(told_turn_rad)
-    return Sight(image.astype(np.uint8), depth_map(t_s, depth), EyeMotion(pose(told, way_m), told.T @ v, np.zeros(3)))
+    return Sight(image.astype(np.uint8), depth_map(t_s, depth), CameraMotion(pose(told, way_m), told.T @ v, np.zeros(3)))
 
 
 def depth_map(t_s: float, depth_m: np.ndarray) -> DepthMap:
     nothing = np.zeros(depth_m.shape, np.bool_)
     return DepthMap(
-        seq=0, t_ns=round(t_s * 1e9), depth_m=depth_m, near=nothing, one_eyed=nothing, pinhole=PINHOLE,
+        seq=0, t_ns=round(t_s * 1e9), depth_m=depth_m, near=nothing, half_occluded=nothing, pinhole=PINHOLE,
         T_rig_rect=np.eye(4), baseline_m=0.3, baseline_sigma_m=0.0, sigma_disparity_px=0.25, near_limit_m=1.0,
         valid_fraction=1.0, ceiling_fraction=0.0, calibration_hash="",
     )  # fmt: skip
@@ -99,11 +99,11 @@ def test_images_without_texture_or_depth_tell_nothing() -> None:
 
 @pytest.mark.parametrize(("factor", "wrong"), [(0.85, False), (1.0, False), (1.15, False), (2.0, True), (0.4, True)])
 def test_most_of_the_telling_frames_must_agree(factor: float, wrong: bool) -> None:
-    watch = ScaleWatch()
+    watch = DepthScaleMonitor()
     told = [watch.check(stretched(one, factor)) for one in FORWARD]
     assert told == ([False] * 4 + [True] * 4 if wrong else [False] * 8), "four pairs of frames"
 
 
 def test_one_odd_frame_is_no_proof() -> None:
-    watch = ScaleWatch()
+    watch = DepthScaleMonitor()
     assert not any(watch.check(stretched(one, 3.0 if n == 3 else 1.0)) for n, one in enumerate(FORWARD))

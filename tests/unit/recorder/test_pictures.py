@@ -137,8 +137,10 @@ def test_depth_colours_run_from_far_to_near_and_leave_unknown_dark() -> None:
 
 def test_view_from_above_has_north_up_and_east_right() -> None:
     pose = Pose(10.0, 5.0, 0.3, 1.0, 0.0, 0.2, 4.0, 0.8)
-    for disc, inside in ((Disc(14.0, 5.0, 0.5), (slice(0, 180), slice(200, 280))),
-                         (Disc(10.0, 9.0, 0.5), (slice(200, 330), slice(350, 450)))):
+    for disc, inside in (
+        (Disc(14.0, 5.0, 0.5), (slice(0, 180), slice(200, 280))),
+        (Disc(10.0, 9.0, 0.5), (slice(200, 330), slice(350, 450))),
+    ):
         picture = TopView(Scene((disc,)), Footprint()).draw(pose)
         green = np.abs(picture.astype(int) - np.array(TREE)).max(axis=2) <= 6
         assert green[inside].sum() > 0.9 * green.sum() > 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.messages.core import Pinhole
-from morpheyes_daemon.perception.camera_motion import EyeMotion, row_rates
+from morpheyes_daemon.perception.camera_motion import CameraMotion, row_rates
 from morpheyes_daemon.stereo.epipolar import RowOffsets, RowWatch, row_offsets
 from morpheyes_daemon.stereo.matching import match
 from morpheyes_daemon.transforms import R_from_rotvec, pose
@@ -68,7 +68,7 @@ def moved(late_s):
 @pytest.mark.parametrize("late_s", [0.002, 0.005, 0.010])
 def test_lateness_is_recovered_from_motion(late_s):
     offsets = measured(moved(late_s))
-    rates = row_rates(offsets.uv, offsets.d_px, PINHOLE, B, EyeMotion(np.eye(4), *MOTION))
+    rates = row_rates(offsets.uv, offsets.d_px, PINHOLE, B, CameraMotion(np.eye(4), *MOTION))
     fit = RowWatch().add(offsets, PINHOLE, *rates)
     assert fit.late_s == pytest.approx(late_s, abs=max(5e-4, 3 * fit.late_sigma_s))
     assert fit.late_sigma_s < 1e-3

@@ -6,7 +6,14 @@ import pytest
 
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import Pinhole
-from morpheyes_daemon.stereo.matching import MatchSettings, _forget_islands, _one_eyed, _runs, disparity_range, match
+from morpheyes_daemon.stereo.matching import (
+    MatchSettings,
+    _forget_islands,
+    _half_occluded,
+    _runs,
+    disparity_range,
+    match,
+)
 from tests.support.panels import Panel, ideal_pair
 
 PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)
@@ -77,7 +84,7 @@ def test_only_what_the_right_eye_cannot_see_is_lost_at_the_left_edge(panel_befor
     inside = (column > truth + 4) & (column < 60)
     assert np.isfinite(found.disparity_px[outside]).mean() < 0.02
     assert np.isfinite(found.disparity_px[inside]).mean() > 0.95
-    assert found.one_eyed[outside].mean() > 0.9
+    assert found.half_occluded[outside].mean() > 0.9
 
 
 def test_what_a_nearer_panel_hides_from_the_right_eye_is_told(panel_before_wall):
@@ -88,11 +95,11 @@ def test_what_a_nearer_panel_hides_from_the_right_eye_is_told(panel_before_wall)
     for row in range(240):
         for u in range(320):
             hidden[row, u] = (partner[row, u + 1 :] < partner[row, u] - 0.5).any() or partner[row, u] < -0.5
-    assert found.one_eyed[hidden].mean() > 0.85
+    assert found.half_occluded[hidden].mean() > 0.85
     grown = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 7), np.uint8)).astype(bool)
-    assert (found.one_eyed & ~grown).mean() < 0.005
-    assert not (found.one_eyed & found.near).any()
-    assert not np.isfinite(found.disparity_px[found.one_eyed | found.near]).any()
+    assert (found.half_occluded & ~grown).mean() < 0.005
+    assert not (found.half_occluded & found.near).any()
+    assert not np.isfinite(found.disparity_px[found.half_occluded | found.near]).any()
 
 
 def test_something_beyond_the_ceiling_is_near_and_never_far():
@@ -167,7 +174,7 @@ def test_rows_taken_two_by_two_cost_little(slanted):
 def test_sizes_that_do_not_divide_are_filled_to_the_edge(slanted):
     left, right, _ = (image[:239, :317] for image in slanted)
     found = match(left, right, 64, MatchSettings(row_step=2))
-    assert found.disparity_px.shape == found.near.shape == found.one_eyed.shape == (239, 317)
+    assert found.disparity_px.shape == found.near.shape == found.half_occluded.shape == (239, 317)
     assert np.isfinite(found.disparity_px[-1, 60:]).mean() > 0.8
 
 
@@ -188,7 +195,7 @@ def test_the_number_of_threads_changes_not_a_bit(panel_before_wall):
     for other in results[1:]:
         assert np.array_equal(results[0].disparity_px, other.disparity_px, equal_nan=True)
         assert np.array_equal(results[0].near, other.near)
-        assert np.array_equal(results[0].one_eyed, other.one_eyed)
+        assert np.array_equal(results[0].half_occluded, other.half_occluded)
 
 
 def test_small_patches_in_the_unknown_are_forgotten_and_branches_are_not():
@@ -209,7 +216,7 @@ def test_small_patches_in_the_unknown_are_forgotten_and_branches_are_not():
 
 
 def slow_one_eyed(disparity, near, ceiling):
-    """The rule of `_one_eyed`, pixel by pixel."""
+    """The rule of `_half_occluded`, pixel by pixel."""
     height, width = disparity.shape
     mask = np.zeros((height, width), bool)
     for row in range(height):
@@ -235,7 +242,7 @@ def test_hidden_pixels_by_runs_are_those_found_one_by_one(seed):
     disparity[rng.random((12, 40)) < 0.5] = np.nan
     near = np.isnan(disparity) & (rng.random((12, 40)) < 0.2)
     disparity[0], near[0] = np.nan, False
-    assert np.array_equal(_one_eyed(disparity, near, 24.0), slow_one_eyed(disparity, near, 24.0))
+    assert np.array_equal(_half_occluded(disparity, near, 24.0), slow_one_eyed(disparity, near, 24.0))
 
 
 def test_runs_are_found_to_the_edges():

@@ -8,7 +8,7 @@ from typing import Any
 
 from morpheyes_daemon.bus import Topics
 from morpheyes_daemon.clock import MS, S, run_virtual, running_clock
-from morpheyes_daemon.control.pose_history import VehicleTrack
+from morpheyes_daemon.control.pose_history import PoseHistory
 from morpheyes_daemon.messages.core import DepthSummary, Intent, Perception
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
@@ -26,7 +26,7 @@ def percept(seq: int, t_ns: int) -> Perception:
 
 
 class Listed:
-    """In the place of strategy and guardian: notes when it was asked and what it was told."""
+    """In the place of strategy and monitor: notes when it was asked and what it was told."""
 
     state = State.ENGAGED
 
@@ -62,7 +62,7 @@ async def fly(listed: Listed, topics: Topics, last_s: float) -> None:
     jobs = [
         mission(
             listed,  # type: ignore[arg-type]
-            VehicleTrack(), SimpleNamespace(stopping=None), listed,  # type: ignore[arg-type]
+            PoseHistory(), SimpleNamespace(stopping=None), listed,  # type: ignore[arg-type]
             topics, clock, 0.3, 0.5, Pulse(clock),
         ),
         publish(topics.perception, FRAMES_NS, percept),

@@ -154,9 +154,7 @@ def test_intrinsic_errors_are_those_of_the_formulas(name):
 def test_a_lens_own_numbers_are_what_errors_are_percent_of():
     lens = replace(paper_lens(4.0), k=(-0.3, 0.0, 0.0, 0.0, 0.0))
     assert nominal(lens, "k1") == -0.3
-    assert intrinsic_error(lens, "k1", 1.0).x_px == pytest.approx(
-        3 * intrinsic_error(paper_lens(4.0), "k1", 1.0).x_px
-    )
+    assert intrinsic_error(lens, "k1", 1.0).x_px == pytest.approx(3 * intrinsic_error(paper_lens(4.0), "k1", 1.0).x_px)
 
 
 def test_rotation_errors_move_the_right_eye_by_what_the_angle_says():

@@ -10,9 +10,7 @@ from morpheyes_daemon.simulation.airframe.wind import Wind, WindConditions
 FT_M = 0.3048
 
 
-def record(
-    conditions: WindConditions, height_m: float, seed: int = 1, steps: int = 40_000
-) -> list[tuple[float, ...]]:
+def record(conditions: WindConditions, height_m: float, seed: int = 1, steps: int = 40_000) -> list[tuple[float, ...]]:
     wind = Wind(conditions, seed)
     rows = []
     for _ in range(steps):

@@ -62,9 +62,7 @@ def test_the_speed_never_changes_sign_under_neutral_sticks() -> None:
 
 
 @given(st.floats(-10, 10), st.floats(0.1, 5), st.floats(0.1, 20))
-def test_the_square_root_gain_is_odd_growing_and_never_above_the_line(
-    error: float, gain: float, limit: float
-) -> None:
+def test_the_square_root_gain_is_odd_growing_and_never_above_the_line(error: float, gain: float, limit: float) -> None:
     out = square_root_gain(error, gain, limit)
     assert square_root_gain(-error, gain, limit) == -out
     assert abs(out) <= abs(gain * error) * (1.0 + 1e-9)

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
 from morpheyes_daemon.flights.flight_plan import make_plan
-from morpheyes_daemon.flights.sim_vehicle import Stage
+from morpheyes_daemon.flights.sim_vehicle import SimVehicle
 from morpheyes_daemon.simulation.autopilot.rc_input import Radio
 from morpheyes_daemon.simulation.crew.sitl_vehicle import AHEAD_NS, KEPT, SitlVehicle
 from tests.support.hand_clock import HandClock
@@ -109,7 +109,7 @@ def test_a_first_picture_may_take_longer_than_poses_are_kept() -> None:
     bench = Bench()
     bench.say(0.0, 0.0, 1.5)
     plan = make_plan("forest", size="160x120", calibration="exact")
-    stage = Stage(plan.scenario, plan.config, bench.clock, vehicle=bench.vehicle)
+    stage = SimVehicle(plan.scenario, plan.config, bench.clock, vehicle=bench.vehicle)
     t_ns = bench.clock.now_ns()
     picture = stage.exposure(1, t_ns)
     for _ in range(KEPT):

@@ -69,7 +69,9 @@ def round_points(solid: Solid, n: int) -> Array:
     side = np.column_stack([ax * np.cos(angle), ay * np.sin(angle), z * size[2]])
     share = np.linspace(0, 1, n)[:, None, None]
     rims = [side[z == end] for end in (-1, 1)]
-    caps = [(np.concatenate([share * rim[:, :2], np.broadcast_to(rim[:, 2:], (n, len(rim), 1))], axis=2)) for rim in rims]
+    caps = [
+        (np.concatenate([share * rim[:, :2], np.broadcast_to(rim[:, 2:], (n, len(rim), 1))], axis=2)) for rim in rims
+    ]
     return np.concatenate([side, *(cap.reshape(-1, 3) for cap in caps)])
 
 

@@ -74,24 +74,24 @@ def test_the_vehicle_passes_the_default_opening_with_forty_millimetres() -> None
     """Level, at the smallest baseline, through the middle: the sides decide, and 40 mm are left on each."""
     world = GapWorld(kind="gap", openings=(Opening(shape="rectangle", across_m=0.0, height_m=1.5),))
     built = build_world(WorldFile(world=world), seed=0)
-    passing = [
-        built.clearance_m(np.array([x, 0.0, -1.5]), np.eye(3), VEHICLE, 0.1) for x in np.linspace(6.5, 7.5, 21)
-    ]
+    passing = [built.clearance_m(np.array([x, 0.0, -1.5]), np.eye(3), VEHICLE, 0.1) for x in np.linspace(6.5, 7.5, 21)]
     assert min(passing) == pytest.approx(0.040, abs=0.002)
-    beside = [
-        built.clearance_m(np.array([x, 0.06, -1.5]), np.eye(3), VEHICLE, 0.1) for x in np.linspace(6.5, 7.5, 21)
-    ]
+    beside = [built.clearance_m(np.array([x, 0.06, -1.5]), np.eye(3), VEHICLE, 0.1) for x in np.linspace(6.5, 7.5, 21)]
     assert min(beside) == pytest.approx(-0.02, abs=0.004)
 
 
 def test_an_opening_looks_as_it_is_judged() -> None:
     """What the renderer shows as hole is what the outline, seen through the camera, encloses."""
-    world = GapWorld(kind="gap", openings=(Opening(shape="goku", slack=2.0),), motion=Motion(kind="periodic", turn_deg=15))
+    world = GapWorld(
+        kind="gap", openings=(Opening(shape="goku", slack=2.0),), motion=Motion(kind="periodic", turn_deg=15)
+    )
     built = build_world(WorldFile(world=world), seed=4)
     T_ned_cam = pose(R_FRD_CAM, np.array([4.5, 0.0, -1.5]))
     shown = Renderer(built.scene).render(T_ned_cam, SMALL, t_s=2.0)
     gap = built.gaps[0]
-    corners = np.column_stack([np.full(len(gap.outlines[0]), -0.5 * gap.thickness_m), gap.outlines[0], np.ones(len(gap.outlines[0]))])
+    corners = np.column_stack(
+        [np.full(len(gap.outlines[0]), -0.5 * gap.thickness_m), gap.outlines[0], np.ones(len(gap.outlines[0]))]
+    )
     seen = corners @ (inverse(T_ned_cam) @ gap.T_ned_wall(2.0)).T
     uv = SMALL.f_px * seen[:, :2] / seen[:, 2:3] + (SMALL.cx_px, SMALL.cy_px)
     inside = np.zeros((SMALL.height, SMALL.width), np.uint8)
@@ -162,9 +162,7 @@ def test_leaning_needs_a_higher_opening() -> None:
 
     def smallest(pitch_deg: float) -> float:
         R = R_from_rpy(0.0, math.radians(pitch_deg), 0.0)
-        return min(
-            built.clearance_m(np.array([x, 0.0, -1.5]), R, VEHICLE, 0.1) for x in np.linspace(6.6, 7.4, 33)
-        )
+        return min(built.clearance_m(np.array([x, 0.0, -1.5]), R, VEHICLE, 0.1) for x in np.linspace(6.6, 7.4, 33))
 
     assert smallest(0.0) == pytest.approx(0.040, abs=0.002)
     assert smallest(-12.0) < 0.025

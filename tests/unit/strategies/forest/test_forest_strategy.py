@@ -12,9 +12,7 @@ from morpheyes_daemon.strategies.forest.strategy import Forest, ForestParameters
 from morpheyes_daemon.strategies.obstacles.polar_profile import ObstacleProfile
 from tests.support.seen_from_above import CRAFT, SUMMARY, blind, empty_profile, with_points
 
-FLYING = VehicleState(
-    t_ns=S, position_t_ns=S, p_ned_m=(0.0, 0.0, -1.5), v_ned_m_s=(3.0, 0.0, 0.0), height_m=1.5
-)
+FLYING = VehicleState(t_ns=S, position_t_ns=S, p_ned_m=(0.0, 0.0, -1.5), v_ned_m_s=(3.0, 0.0, 0.0), height_m=1.5)
 
 NORTH = Goal(forward_m=80.0)
 
@@ -29,7 +27,9 @@ def engaged(
     for k, profile in enumerate(profiles, 1):
         t_ns = S + k * S // 5
         shown = replace(profile, t_ns=t_ns)
-        command = forest.decide(Observation(t_ns, shown, SUMMARY, vehicle, vehicle, 0.1, braking_m, 2.0 * braking_m, True))
+        command = forest.decide(
+            Observation(t_ns, shown, SUMMARY, vehicle, vehicle, 0.1, braking_m, 2.0 * braking_m, True)
+        )
     return command
 
 

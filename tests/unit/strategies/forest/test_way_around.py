@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.strategies.forest.bug_algorithm import PATIENCE_S, STALLED_S, WayAround
+from morpheyes_daemon.strategies.forest.bug_algorithm import PATIENCE_S, STALLED_S, BugAlgorithm
 
 LATER_NS = round((STALLED_S + 1.0) * S)
 HEADINGS = np.linspace(-0.5, 0.5, 11)
 
 
 def test_it_begins_only_when_the_goal_comes_no_nearer() -> None:
-    around = WayAround()
+    around = BugAlgorithm()
     for second in range(60):
         assert not around.update(80.0 - 0.5 * second, 0.1, second * S)
     assert not around.update(51.0, 0.1, 60 * S)
@@ -20,7 +20,7 @@ def test_it_begins_only_when_the_goal_comes_no_nearer() -> None:
 
 
 def test_what_is_in_the_way_is_kept_on_the_goals_side_until_it_is_nearer_than_ever() -> None:
-    around = WayAround()
+    around = BugAlgorithm()
     around.update(20.0, -0.3, 0)
     assert around.update(20.0, -0.3, LATER_NS)
     assert around.side == -1
@@ -31,7 +31,7 @@ def test_what_is_in_the_way_is_kept_on_the_goals_side_until_it_is_nearer_than_ev
 
 
 def test_it_takes_the_outermost_heading_that_is_wide_enough() -> None:
-    around = WayAround()
+    around = BugAlgorithm()
     around.update(20.0, 0.3, 0)
     around.update(20.0, 0.3, LATER_NS)
     free = np.array([9.0, 9.0, 9.0, 8.0, 6.0, 5.0, 4.0, 3.5, 1.5, 0.8, 0.4])
@@ -40,14 +40,14 @@ def test_it_takes_the_outermost_heading_that_is_wide_enough() -> None:
 
 
 def test_it_ends_where_nothing_is_in_the_way() -> None:
-    around = WayAround()
+    around = BugAlgorithm()
     around.update(20.0, 0.3, 0)
     assert around.update(20.0, 0.3, LATER_NS)
     around.end(LATER_NS)
     assert not around.update(20.0, 0.3, LATER_NS + S)
 
 
-def flown_s(around: WayAround, second: int) -> int:
+def flown_s(around: BugAlgorithm, second: int) -> int:
     """How long the way around that begins after `second` is flown when it leads nowhere."""
     while not around.update(20.0, 0.3, second * S):
         second += 1
@@ -58,7 +58,7 @@ def flown_s(around: WayAround, second: int) -> int:
 
 
 def test_one_that_leads_nowhere_is_given_up_the_next_one_later() -> None:
-    around = WayAround()
+    around = BugAlgorithm()
     assert flown_s(around, 0) == PATIENCE_S
     assert flown_s(around, 100) == 2 * PATIENCE_S
     assert not around.update(15.0, 0.3, 300 * S), "nearer"
@@ -66,7 +66,7 @@ def test_one_that_leads_nowhere_is_given_up_the_next_one_later() -> None:
 
 
 def test_forgotten_before_the_mission_engages() -> None:
-    around = WayAround()
+    around = BugAlgorithm()
     around.update(20.0, 0.3, 0)
     around.update(20.0, 0.3, LATER_NS)
     around.reset()

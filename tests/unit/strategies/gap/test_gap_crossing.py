@@ -83,7 +83,9 @@ def test_a_run_that_has_begun_keeps_its_plan_until_the_speed_shows():
     assert crossing.arrives_s(0.9, 3.0, NOW_NS + 3 * S) == pytest.approx(0.3)  # late: no sooner than at the set speed
 
 
-@pytest.mark.parametrize(("planned_s", "left_s"), [(0.35, 0.35), (0.25, 0.25), (2.0, 0.3 + KEPT_S), (-1.0, 0.3 - KEPT_S)])
+@pytest.mark.parametrize(
+    ("planned_s", "left_s"), [(0.35, 0.35), (0.25, 0.25), (2.0, 0.3 + KEPT_S), (-1.0, 0.3 - KEPT_S)]
+)
 def test_the_opening_is_met_at_the_planned_crossing_unless_it_is_reached_at_quite_another_time(planned_s, left_s):
     crossing = Crossing(GapParameters(speed_m_s=3.0), t_ns=NOW_NS + round(planned_s * S), begun_ns=NOW_NS - 3 * S)
     assert crossing.left_s(0.9, 3.0, NOW_NS) == pytest.approx(left_s)

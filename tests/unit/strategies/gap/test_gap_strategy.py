@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.config.vehicle import Footprint
-from morpheyes_daemon.control.path_following import LEAN_LAG_S, LineKeeper
+from morpheyes_daemon.control.path_following import LEAN_LAG_S, PathFollower
 from morpheyes_daemon.messages.core import DepthSummary, Intent, VehicleState
 from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
@@ -35,7 +35,7 @@ class Course:
         self.strategy = Gap(GapParameters(**parameters), CRAFT)
         self.show, self.now_ns = show, 10 * S
         self.vehicle = VehicleState(p_ned_m=(0.0, 0.0, -1.5))
-        self.keeper = LineKeeper()
+        self.keeper = PathFollower()
         self.baseline_m = 0.3
         self.commands, self.phases, self.ranges = [], [], []
         self.step(engaged=False)
@@ -53,7 +53,9 @@ class Course:
         )
         speed = math.hypot(*self.vehicle.v_ned_m_s)
         command = self.strategy.decide(
-            Observation(self.now_ns, percept, summary, self.vehicle, self.vehicle, self.baseline_m, speed, speed, engaged)
+            Observation(
+                self.now_ns, percept, summary, self.vehicle, self.vehicle, self.baseline_m, speed, speed, engaged
+            )
         )
         self.commands.append(command)
         self.phases.append(self.strategy._phase)

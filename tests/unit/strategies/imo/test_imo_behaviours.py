@@ -65,9 +65,7 @@ def track(p: tuple[float, float, float], v: tuple[float, float, float], depth_m:
 def decide(imo: Imo, found: Track | None, at_s: float = 10.0, engaged: bool = True) -> MissionCommand:
     vehicle = VehicleState(t_ns=round(at_s * S), position_t_ns=round(at_s * S), p_ned_m=(0.0, 0.0, -1.5), height_m=1.5)
     percept = ImoPercept(found, 100, 10, empty_profile(0.0))
-    return imo.decide(
-        Observation(round(at_s * S), percept, SUMMARY, vehicle, vehicle, 0.1, 0.5, 0.5, engaged)
-    )
+    return imo.decide(Observation(round(at_s * S), percept, SUMMARY, vehicle, vehicle, 0.1, 0.5, 0.5, engaged))
 
 
 def mission(**parameters: object) -> Imo:

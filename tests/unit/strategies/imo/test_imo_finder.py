@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.messages.core import Track
-from morpheyes_daemon.strategies.imo.tracker import Finder
+from morpheyes_daemon.strategies.imo.tracker import ObjectTracker
 from tests.support.moving_square import Square, moved, view
 
 
@@ -13,7 +13,7 @@ def along(start: Square, step: tuple[float, float, float], frames: int) -> list[
 
 
 def test_an_object_that_crosses_is_found_within_a_second_and_measured_to_one_percent() -> None:
-    finder = Finder()
+    finder = ObjectTracker()
     squares = along(Square((2.5, -0.5, 0.0)), (0.0, 0.06, 0.0), 14)
     tracks = [finder.step(view(k, square)) for k, square in enumerate(squares)]
     assert all(track is not None and track.seen for track in tracks[5:])
@@ -28,7 +28,7 @@ def test_an_object_that_crosses_is_found_within_a_second_and_measured_to_one_per
 
 
 def test_it_is_kept_until_it_is_a_dozen_pixels_wide() -> None:
-    finder = Finder()
+    finder = ObjectTracker()
     squares = along(Square((1.6, -0.2, 0.0), 0.16), (0.2, 0.02, 0.005), 18)
     tracks = [finder.step(view(k, square, baseline_m=0.3)) for k, square in enumerate(squares)]
     for track, square in list(zip(tracks, squares, strict=True))[5:]:
@@ -39,7 +39,7 @@ def test_it_is_kept_until_it_is_a_dozen_pixels_wide() -> None:
 
 
 def test_an_object_that_fills_most_of_the_image_does_not_become_the_frame_of_reference() -> None:
-    finder = Finder()
+    finder = ObjectTracker()
     squares = along(Square((0.6, -0.05, 0.0), 0.35), (0.0, 0.015, 0.0), 10)
     tracks = [finder.step(view(k, square, baseline_m=0.1)) for k, square in enumerate(squares)]
     last = tracks[-1]
@@ -49,7 +49,7 @@ def test_an_object_that_fills_most_of_the_image_does_not_become_the_frame_of_ref
 
 
 def test_a_scene_that_stands_holds_no_object_though_the_vehicle_moves_and_the_autopilot_errs() -> None:
-    finder = Finder()
+    finder = ObjectTracker()
     rng = np.random.default_rng(5)
     for k in range(25):
         eye = (0.0, 0.4 * np.sin(0.5 * k), 0.1 * np.sin(0.3 * k))
@@ -58,7 +58,7 @@ def test_a_scene_that_stands_holds_no_object_though_the_vehicle_moves_and_the_au
 
 
 def test_the_moving_one_is_found_from_a_moving_vehicle() -> None:
-    finder = Finder()
+    finder = ObjectTracker()
     squares = along(Square((2.5, -0.4, 0.0)), (0.03, 0.05, 0.0), 14)
     tracks = [
         finder.step(view(k, square, (0.0, 0.2 * np.sin(0.5 * k), 0.0), told_error_m=0.01 * (-1) ** k))
@@ -68,7 +68,7 @@ def test_the_moving_one_is_found_from_a_moving_vehicle() -> None:
 
 
 def test_it_is_found_again_after_a_second_behind_something() -> None:
-    finder = Finder(coast_s=2.0)
+    finder = ObjectTracker(coast_s=2.0)
     squares = along(Square((2.5, -0.6, 0.0)), (0.0, 0.06, 0.0), 24)
     tracks = [finder.step(view(k, square, hidden=10 <= k < 15)) for k, square in enumerate(squares)]
     before, behind, after = tracks[9], tracks[13], tracks[16]
@@ -82,7 +82,7 @@ def test_it_is_found_again_after_a_second_behind_something() -> None:
 
 
 def test_what_covers_it_is_not_taken_for_it_and_does_not_turn_its_way() -> None:
-    finder = Finder(coast_s=2.0)
+    finder = ObjectTracker(coast_s=2.0)
     cover = Square((1.8, 0.1, 0.0), 0.3)  # hides 0.42 m at the object's depth
     squares = along(Square((2.5, -0.6, 0.0)), (0.0, 0.06, 0.0), 26)
     tracks = [finder.step(view(k, square, cover=cover)) for k, square in enumerate(squares)]
@@ -100,7 +100,7 @@ def test_what_covers_it_is_not_taken_for_it_and_does_not_turn_its_way() -> None:
 
 
 def test_what_stops_for_long_is_part_of_the_scene() -> None:
-    finder = Finder()
+    finder = ObjectTracker()
     squares = along(Square((2.5, -0.4, 0.0)), (0.0, 0.06, 0.0), 10)
     squares += [squares[-1]] * 45
     tracks = [finder.step(view(k, square)) for k, square in enumerate(squares)]

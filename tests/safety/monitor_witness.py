@@ -1,7 +1,7 @@
 """A second, independent statement of the rules of safety/, which watches everything that the gate lets out.
 
 It keeps no states: it remembers what was heard and judges each output by the rules in docs/safety.md. It shares no
-code with the guardian.
+code with the monitor.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, GateOutput
 from morpheyes_daemon.safety.gate import StickLimits
 from morpheyes_daemon.safety.leases import Lease
-from morpheyes_daemon.safety.monitor import GuardianLimits
+from morpheyes_daemon.safety.monitor import SafetyMonitorLimits
 
 BELIEVABLE_NS = 10 * S
 
 
 class Witness:
-    """Told of everything just before the guardian is; `check` raises AssertionError for an output that may not be."""
+    """Told of everything just before the monitor is; `check` raises AssertionError for an output that may not be."""
 
-    def __init__(self, limits: GuardianLimits) -> None:
+    def __init__(self, limits: SafetyMonitorLimits) -> None:
         self.limits = limits
         self.sticks: StickLimits | None = None
         self.vehicle = VehicleState()
@@ -51,7 +51,7 @@ class Witness:
         news = vehicle.rc_t_ns and (vehicle.rc_t_ns, vehicle.rc_us) != (self.vehicle.rc_t_ns, self.vehicle.rc_us)
         self.vehicle = vehicle
         if news:
-            self._hear_switch(vehicle.rc_t_ns, width)
+            self._update_switch(vehicle.rc_t_ns, width)
         if vehicle.heartbeat_t_ns:
             self._lease(Lease.LINK, vehicle.heartbeat_t_ns + round(self.limits.link_timeout_s * S))
         measured = min(vehicle.attitude_t_ns, vehicle.position_t_ns)
@@ -60,7 +60,7 @@ class Witness:
             self._lease(Lease.VEHICLE, measured + round(self.limits.vehicle_timeout_s * S))
         return bool(news and self.rc and self.rc[-1][1] is False) or not self._may_hold()
 
-    def _hear_switch(self, t_ns: int, width: float) -> None:
+    def _update_switch(self, t_ns: int, width: float) -> None:
         newest = self.newest_rc_ns
         if not 800 <= width <= 2200:
             self.rc.append((newest, None))
@@ -106,9 +106,7 @@ class Witness:
     def trouble(self, now_ns: int) -> bool:
         vehicle = self.vehicle
         position = vehicle.ekf_t_ns and vehicle.ekf_flags & 0x18 and not vehicle.ekf_flags & 0x80
-        gcs_lost = self.limits.gcs_timeout_s is not None and (
-            now_ns - vehicle.gcs_t_ns >= self.limits.gcs_timeout_s * S
-        )
+        gcs_lost = self.limits.gcs_timeout_s is not None and (now_ns - vehicle.gcs_t_ns >= self.limits.gcs_timeout_s * S)
         empty = 0.0 <= vehicle.battery_fraction < self.limits.battery_low
         return not position or vehicle.system_status > 4 or vehicle.rc_rssi == 0 or empty or gcs_lost
 
@@ -137,7 +135,7 @@ class Witness:
     # -- what it judges -----------------------------------------------------------------------------------------
 
     def check(self, out: GateOutput) -> None:
-        """Judge what has just gone out to the autopilot."""
+        """Referee what has just gone out to the autopilot."""
         self.counts[out.action] += 1
         if out.action is Action.RELEASE:
             assert out.widths_us == (0, 0, 0, 0)

@@ -1,4 +1,4 @@
-"""The autopilot hub on in-memory links to the autopilot twin, on virtual time."""
+"""The autopilot connection on in-memory links to the autopilot twin, on virtual time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, S, running_clock
 from morpheyes_daemon.config.vehicle import AutopilotConfig
-from morpheyes_daemon.devices.autopilot.connection import AutopilotHub
+from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
 from morpheyes_daemon.devices.link import Link, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.errors import DeviceNotFoundError
 from morpheyes_daemon.messages.core import Event, VehicleState
@@ -23,8 +23,8 @@ from morpheyes_daemon.simulation.autopilot.twin import AutopilotTwin
 DELAY_S = 0.004
 
 
-class HubBench:
-    """`async with HubBench(...)`: hub and twin run; `link` is the twin's end of the newest connection."""
+class ConnectionBench:
+    """`async with ConnectionBench(...)`: connection and twin run; `link` is the twin's end of the newest connection."""
 
     def __init__(
         self,
@@ -49,13 +49,13 @@ class HubBench:
         self._run_hub = run_hub
         self._near: MemoryLink | None = None
         self._on_lost: OnLost = lambda reason: None
-        self.hub = AutopilotHub(AutopilotConfig(**config), self.clock, self.topics, self.log, self.open)
+        self.connection = AutopilotConnection(AutopilotConfig(**config), self.clock, self.topics, self.log, self.open)
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self) -> Self:
         self._tasks = [asyncio.create_task(self.twin.run())]
         if self._run_hub:
-            self._tasks.append(asyncio.create_task(self.hub.run()))
+            self._tasks.append(asyncio.create_task(self.connection.run()))
         return self
 
     async def __aexit__(self, *error: object) -> None:
@@ -83,7 +83,7 @@ class HubBench:
         return near
 
     def pull(self) -> None:
-        """Unplug the cable: both ends are dead and the hub is told so."""
+        """Unplug the cable: both ends are dead and the connection is told so."""
         self.plugged = False
         self.mute()
         self._on_lost("unplugged")
@@ -108,7 +108,7 @@ class HubBench:
 
     async def ready(self) -> None:
         """Wait until parameters are read and everything streams."""
-        await self.until(lambda: self.hub.parameters.complete and self.vehicle.position_t_ns > 0)
+        await self.until(lambda: self.connection.parameters.complete and self.vehicle.position_t_ns > 0)
 
     @property
     def vehicle(self) -> VehicleState:
@@ -119,5 +119,5 @@ class HubBench:
         return [event.reason for event in self.events]
 
     def sent_of(self, kind: str) -> list[Any]:
-        """What the hub sent, by message type."""
+        """What the connection sent, by message type."""
         return [message for message in self.sent if message.get_type() == kind]
