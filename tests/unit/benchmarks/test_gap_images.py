@@ -4,10 +4,10 @@ import struct
 
 import numpy as np
 import pytest
-from real_images import real_images
 
 from morpheyes_daemon.benchmarks.gap_on_real_images import focus_of_expansion, gap_images, largest_hole, read_flo
 from morpheyes_daemon.errors import InputError
+from tests.support.real_images import real_images
 
 
 @pytest.mark.realdata

@@ -5,10 +5,10 @@ import math
 import cv2
 import numpy as np
 import pytest
-from walls import PINHOLE, T_ned_rect, depth_map, depth_of_wall, rectangle
 
 from morpheyes_daemon.strategies.gap.openings import Silhouette, find_openings, passage
 from morpheyes_daemon.strategies.gap.wall_segmentation import median, split
+from tests.support.walls import PINHOLE, T_ned_rect, depth_map, depth_of_wall, rectangle
 
 VEHICLE = Silhouette(0.337, 0.187)
 PX_M = 4.0 / PINHOLE.f_px
