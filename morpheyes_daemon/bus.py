@@ -21,6 +21,8 @@ from morpheyes_daemon.messages.core import (
     Track,
     VehicleState,
 )
+from morpheyes_daemon.messages.mission import Observation
+from morpheyes_daemon.messages.safety import GateOutput, Health
 
 T = TypeVar("T")
 
@@ -103,6 +105,26 @@ class EventLog:
             handler(event)
 
 
+class StickPulse:
+    """Struck by the stick task right after each stick message; tasks with milliseconds of work wait for it."""
+
+    def __init__(self) -> None:
+        self._waiting: list[asyncio.Future[None]] = []
+
+    def strike(self) -> None:
+        """Wake whoever waits."""
+        waiting, self._waiting = self._waiting, []
+        for future in waiting:
+            if not future.done():
+                future.set_result(None)
+
+    async def next(self) -> None:
+        """Wait for the next strike."""
+        future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting.append(future)
+        await future
+
+
 def _topic(log_every: int, description: str) -> Any:
     return field(metadata={"log_every": log_every, "description": description})
 
@@ -114,14 +136,14 @@ class Topics:
     frame: Latest[StereoFrame] = _topic(5, "stereo frames as captured, with their baseline")
     perception: Latest[Perception] = _topic(1, "depth summary and the strategy's percept per frame")
     vehicle: Latest[VehicleState] = _topic(5, "attitude, velocity, mode, RC as the autopilot reports them")
-    observation: Latest[Any] = _topic(1, "what the strategy decided on, for replay")
+    observation: Latest[Observation] = _topic(1, "what the strategy decided on, for replay")
     track: Latest[Track] = _topic(1, "the moving object that is being followed")
     command: Latest[MissionCommand] = _topic(1, "what the mission wants")
     governed: Latest[Governed] = _topic(5, "speed limit and the bound that set it")
     sticks: Latest[Sticks] = _topic(1, "stick positions offered to the gate")
-    gate: Latest[Any] = _topic(1, "what the gate let out: sticks, neutral, or released")
+    gate: Latest[GateOutput] = _topic(1, "what the gate let out: sticks, neutral, or released")
     baseline: Latest[BaselineEstimate] = _topic(2, "modelled baseline")
-    health: Latest[Any] = _topic(1, "ages, rates and lateness of everything")
+    health: Latest[Health] = _topic(1, "ages, rates and lateness of everything")
 
     @classmethod
     def create(cls) -> Topics:

@@ -24,17 +24,17 @@ def command(
     import asyncio
 
     from morpheyes_daemon.config.packaged import load_config
-    from morpheyes_daemon.daemon.service import calibration_file, real_time_runner, serve
+    from morpheyes_daemon.daemon.service import load_rig, real_time_runner, serve
+    from morpheyes_daemon.perception.pipeline import PipelineFactory
     from morpheyes_daemon.strategies.missions import find_mission, load_mission
 
     vehicle = load_config(config)
     if calibration is not None:
         vehicle = vehicle.model_copy(update={"calibration": calibration})
     name = mission or vehicle.mission
-    file = load_mission(name)
-    calibration_file(vehicle)
+    pipeline = PipelineFactory(vehicle, load_mission(name), load_rig(vehicle))
     with real_time_runner() as runner:
         try:
-            runner.run(serve(vehicle, find_mission(name).stem, file, lambda line: typer.echo(line, err=True)))
+            runner.run(serve(pipeline, find_mission(name).stem, lambda line: typer.echo(line, err=True)))
         except asyncio.CancelledError:
             raise typer.Exit(130) from None

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 
 class Section(BaseModel):
@@ -72,7 +72,34 @@ class V4l2CameraConfig(CameraBase):
     swap_eyes: bool = Field(False, description="the right eye is in the left half")
 
 
-CameraConfig = Annotated[SimCameraConfig | RecordingCameraConfig | V4l2CameraConfig, Field(discriminator="backend")]
+class PluginConfig(Section):
+    """A backend of another package, found through its entry point; it checks the `options` itself."""
+
+    backend: str = Field(min_length=1, max_length=100)
+    options: Any = Field(default_factory=dict, description="the backend's own settings")
+
+
+class PluginCameraConfig(CameraBase, PluginConfig):
+    """A camera of another package (entry point group `morpheyes.cameras`)."""
+
+
+def _backend_of(*built_in: str) -> Discriminator:
+    """Choose among the named backends; any other name is a plugin's."""
+
+    def tag(value: Any) -> str:
+        backend = value.get("backend") if isinstance(value, dict) else getattr(value, "backend", None)
+        return backend if backend in built_in else "plugin"
+
+    return Discriminator(tag)
+
+
+CameraConfig = Annotated[
+    Annotated[SimCameraConfig, Tag("sim")]
+    | Annotated[RecordingCameraConfig, Tag("recording")]
+    | Annotated[V4l2CameraConfig, Tag("v4l2")]
+    | Annotated[PluginCameraConfig, Tag("plugin")],
+    _backend_of("sim", "recording", "v4l2"),
+]
 
 
 class ServoMotion(Section):
@@ -109,13 +136,24 @@ class NoServoConfig(Section):
     baseline_mm: float = Field(200.0, ge=10, le=1000)
 
 
-ServoConfig = Annotated[SerialServoConfig | NoServoConfig, Field(discriminator="backend")]
+class PluginServoConfig(PluginConfig):
+    """A servo of another package (entry point group `morpheyes.servos`)."""
+
+    motion: ServoMotion = ServoMotion()
+
+
+ServoConfig = Annotated[
+    Annotated[SerialServoConfig, Tag("serial")]
+    | Annotated[NoServoConfig, Tag("none")]
+    | Annotated[PluginServoConfig, Tag("plugin")],
+    _backend_of("serial", "none"),
+]
 
 
 class AutopilotConfig(Section):
     """The MAVLink link to ArduCopter."""
 
-    backend: Literal["mavlink"] = "mavlink"
+    backend: str = Field("mavlink", min_length=1, description="mavlink, or another package's (morpheyes.autopilots)")
     url: str = Field("serial:/dev/ttyAMA0:921600", min_length=1, description="serial:, tcp:, udp: or udpin:")
     vehicle_sysid: int = Field(1, ge=1, le=254)
     override_sysid: int = Field(255, ge=1, le=255, description="must equal MAV_GCS_SYSID (SYSID_MYGCS before 4.7)")

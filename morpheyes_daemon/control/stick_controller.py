@@ -1,11 +1,13 @@
 """One stick period: the mission's command through the governor and the velocity loop to stick positions.
 
-Pure composition of `governor`, `velocity` and `loiter`; what it returns still has the gate before it.
+Pure composition of `governor`, `velocity` and `loiter`; what it returns still has the gate before it. It exists from
+the start and is configured when the autopilot's parameters have been read; before that it offers no sticks.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 from morpheyes_daemon.control.governor import Governor
@@ -16,7 +18,44 @@ from morpheyes_daemon.messages.core import DepthSummary, Governed, MissionComman
 
 
 class StickController:
-    """Holds the velocity loop; made anew when the autopilot's parameters change."""
+    """The flight control of one vehicle, whose velocity loop is made anew when its Loiter model changes.
+
+    `tuning_for` gives the velocity loop's bounds for a Loiter model.
+    """
+
+    def __init__(self, governor: Governor, tuning_for: Callable[[LoiterModel], VelocityTuning]) -> None:
+        self._governor = governor
+        self._tuning_for = tuning_for
+        self._loop: _Loop | None = None
+
+    @property
+    def model(self) -> LoiterModel | None:
+        """The Loiter model, None before the autopilot's parameters are known."""
+        return self._loop.model if self._loop else None
+
+    def configure(self, model: LoiterModel) -> None:
+        """Take the vehicle's Loiter model; the same one again keeps what the velocity loop has learned."""
+        if self.model != model:
+            self._loop = _Loop(model, self._governor, self._tuning_for(model))
+
+    def reset(self) -> None:
+        """Forget what the velocity loop has learned; call while the sticks are not ours."""
+        if self._loop is not None:
+            self._loop.reset()
+
+    def step(
+        self, command: MissionCommand, summary: DepthSummary, vehicle: VehicleState, now_ns: int
+    ) -> tuple[Sticks, Governed] | None:
+        """Return the sticks for a command and what the governor made of its speed; None before `configure`."""
+        return self._loop.step(command, summary, vehicle, now_ns) if self._loop else None
+
+    def stopping_distance_m(self, speed_m_s: float, height_m: float, reaction_s: float = 0.0) -> float:
+        """Return the distance to a stop from a speed, `reaction_s` of flying on included; inf before `configure`."""
+        return self._loop.model.stopping_distance_m(speed_m_s, height_m, reaction_s) if self._loop else math.inf
+
+
+class _Loop:
+    """Governor, path following and velocity loop on one Loiter model."""
 
     def __init__(self, model: LoiterModel, governor: Governor, tuning: VelocityTuning) -> None:
         self.model = model
@@ -25,14 +64,13 @@ class StickController:
         self._line = PathFollower()
 
     def reset(self) -> None:
-        """Forget what the loop has learned; call while the sticks are not ours."""
+        """Forget what the loop has learned."""
         self._velocity.reset()
         self._line.reset()
 
     def step(
         self, command: MissionCommand, summary: DepthSummary, vehicle: VehicleState, now_ns: int
     ) -> tuple[Sticks, Governed]:
-        """Return the sticks for a command and what the governor made of its speed."""
         height_m = height_above_ground_m(vehicle, now_ns)
         quick = command.line is not None and command.line.integral_1_s2 > 0.0
         steadied = self._velocity.steadied(vehicle, now_ns)

@@ -1,6 +1,6 @@
 """The daemon on real devices, as systemd or a person starts it: parts, flight log, page, mavsdk, systemd and signals.
 
-What is not connected is waited for in PREFLIGHT. Everything that decides about flight is in app.py and below it.
+What is not connected is waited for in PREFLIGHT. Everything that decides about flight is in composition.py and below it.
 """
 
 from __future__ import annotations
@@ -10,22 +10,20 @@ import gc
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from pathlib import Path
 
 from morpheyes_daemon import __version__
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, running_clock, wall_time_s
-from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
+from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.daemon.composition import Daemon, Parts
 from morpheyes_daemon.daemon.sd_notify import notify
 from morpheyes_daemon.daemon.systemd import SystemdReport
 from morpheyes_daemon.dashboard.server import Dashboard
 from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
 from morpheyes_daemon.devices.camera import build_camera
-from morpheyes_daemon.devices.link import open_link
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.servo import build_servo
-from morpheyes_daemon.doctor.findings import Severity
-from morpheyes_daemon.doctor.rig import examine_calibration
+from morpheyes_daemon.doctor.rig import examine_rig
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
@@ -34,7 +32,8 @@ from morpheyes_daemon.perception.craft import fitting_rig
 from morpheyes_daemon.perception.pipeline import PipelineFactory
 from morpheyes_daemon.recorder.flight_log import flight_header, flight_path
 from morpheyes_daemon.recorder.recorder import Recorder
-from morpheyes_daemon.stereo.calibration_file import calibration_hash, read_calibration
+from morpheyes_daemon.stereo.calibration_file import calibration_hash
+from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.supervisor.supervisor import Pulse, Task
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 
@@ -45,30 +44,27 @@ DASHBOARD_IMAGE_HZ = 2.0
 Say = Callable[[str], None]
 
 
-def calibration_file(config: VehicleConfig) -> Path:
-    """Return the configured calibration; raises CalibrationError when it does not fit the rig."""
+def load_rig(config: VehicleConfig) -> RigModel:
+    """Read the configured calibration; raises CalibrationError when there is none or it does not fit the vehicle."""
     if config.calibration is None:
         raise CalibrationError(
             "calibration is not set: make a file with `morpheyes calibrate solve` and name it in config.yaml, "
             "or give --calibration FILE."
         )
-    fitting_rig(config.calibration, config)
-    return config.calibration
+    return fitting_rig(config.calibration, config)
 
 
 def build_parts(
-    config: VehicleConfig,
-    mission: MissionFile,
-    clock: Clock,
-    events: EventLog,
+    pipeline: PipelineFactory,
+    context: DeviceContext,
     tell: Callable[[Health], None] = lambda report: None,
     film: bool = False,
 ) -> Parts:
     """Return the real devices and the vision worker, nothing open yet; `film` keeps a picture of every frame.
 
-    Raises ConfigError or CalibrationError.
+    Raises ConfigError.
     """
-    pipeline = PipelineFactory(config, mission, calibration_file(config))
+    config, clock, events = pipeline.config, context.clock, context.events
 
     def on_worker_death(text: str) -> None:
         events.publish(Event(clock.now_ns(), "vision", Reason.WORKER_LOST, text))
@@ -78,28 +74,30 @@ def build_parts(
     page_hz = DASHBOARD_IMAGE_HZ if config.dashboard.enabled else 0.0
     return Parts(
         clock=clock,
-        camera=build_camera(config.camera, clock),
-        servo=build_servo(config.servo, open_link, clock, events),
-        opener=open_link,
+        camera=build_camera(config.camera, context),
+        servo=build_servo(config.servo, context),
+        opener=context.opener,
         worker=ProcessWorker(pipeline, job_timeout_s=JOB_TIMEOUT_S, on_idle_death=on_worker_death),
         image_rate_hz=max(log_hz, page_hz),
         tell=tell,
     )
 
 
-async def serve(config: VehicleConfig, mission_name: str, mission: MissionFile, say: Say) -> None:
+async def serve(pipeline: PipelineFactory, mission_name: str, say: Say) -> None:
     """Run until SIGINT or SIGTERM; `say` gets one line for every change."""
+    config, mission = pipeline.config, pipeline.mission
     clock, topics, events = running_clock(), Topics.create(), EventLog()
     began_ns = clock.now_ns()
     events.subscribe(lambda event: say(event_line(event, began_ns)))
     systemd = SystemdReport()
-    daemon = Daemon(config, mission, build_parts(config, mission, clock, events, systemd.tell), topics, events)
+    parts = build_parts(pipeline, DeviceContext(clock, events, topics), systemd.tell)
+    daemon = Daemon(config, mission, parts, topics, events)
     for task in _companions(daemon, mission_name, clock):
         daemon.supervisor.add(task)
     stop = asyncio.Event()
-    with ending_by_signal(stop), closing(_recorder(daemon, mission_name, mission, clock)) as recorder:
+    with ending_by_signal(stop), closing(_recorder(daemon, mission_name, pipeline, clock)) as recorder:
         say(f"mission {mission_name}, calibration {config.calibration}, log {recorder.path}")
-        check_calibration(daemon, clock)
+        daemon.stop_findings.take("calibration", examine_rig(pipeline.rig, config))
         await daemon.run(stop)
         notify("STOPPING=1")
 
@@ -142,23 +140,13 @@ def ending_by_signal(stop: asyncio.Event) -> Iterator[None]:
             loop.remove_signal_handler(number)
 
 
-def check_calibration(daemon: Daemon, clock: Clock) -> None:
-    """What the doctor says against the calibration keeps the daemon from engaging."""
-    findings, _ = examine_calibration(daemon.config)
-    for finding in findings:
-        if finding.severity is Severity.STOP:
-            daemon.monitor.set_missing(Reason.DOCTOR_SAYS_NO, "calibration")
-            text = f"{finding.id}: {finding.evidence}; {finding.remedy}"
-            daemon.events.publish(Event(clock.now_ns(), "doctor", Reason.DOCTOR_SAYS_NO, text))
-
-
-def _recorder(daemon: Daemon, mission_name: str, mission: MissionFile, clock: Clock) -> Recorder:
+def _recorder(daemon: Daemon, mission_name: str, pipeline: PipelineFactory, clock: Clock) -> Recorder:
     config = daemon.config
     header = flight_header(
         mission=mission_name,
-        mission_file=mission,
+        mission_file=pipeline.mission,
         config=config,
-        calibration_hash=calibration_hash(read_calibration(calibration_file(config))),
+        calibration_hash=calibration_hash(pipeline.rig),
         wall_s=wall_time_s(),
     )
     return Recorder(

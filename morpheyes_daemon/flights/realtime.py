@@ -22,6 +22,7 @@ from morpheyes_daemon.clock import S, running_clock, stopwatch_s, wall_time_s
 from morpheyes_daemon.config.vehicle import AutopilotConfig, SerialServoConfig, VehicleConfig
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.daemon.service import build_parts, real_time_runner
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.errors import DeviceLostError, DeviceTimeoutError
 from morpheyes_daemon.flights.artifacts import FILES
 from morpheyes_daemon.flights.lockstep import FlightPlan, Progress, Summary, Tally, summarize_flight
@@ -30,7 +31,7 @@ from morpheyes_daemon.flights.simulator_process import End, PilotAct, Ready, Sim
 from morpheyes_daemon.flights.stick_timing import StickIntervals, StickTiming
 from morpheyes_daemon.messages.core import Perception
 from morpheyes_daemon.messages.safety import GateOutput
-from morpheyes_daemon.perception.pipeline import VisionJob
+from morpheyes_daemon.perception.pipeline import PipelineFactory, VisionJob
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.reader import read_flight
 from morpheyes_daemon.recorder.recorder import Recorder
@@ -212,7 +213,11 @@ async def realtime_daemon(
         async with simulator_process(job, progress) as simulator:
             ready = await simulator.get_ready()
             config = device_config(plan, ready, address)
-            parts = build_parts(config, plan.mission, clock, events, film=True)
+            parts = build_parts(
+                PipelineFactory(config, plan.mission, read_calibration(plan.calibration)),
+                DeviceContext(clock, events, topics),
+                film=True,
+            )
             worker = parts.worker
             assert isinstance(worker, ProcessWorker)
             daemon = Daemon(config, plan.mission, parts, topics, events)

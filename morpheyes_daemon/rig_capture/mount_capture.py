@@ -44,10 +44,10 @@ class HandHeldVehicle:
     def __init__(self, config: VehicleConfig, clock: Clock, opener: LinkOpener) -> None:
         self._clock = clock
         self._topics = Topics.create()
-        self._hub = AutopilotConnection(config.autopilot, clock, self._topics, EventLog(), opener)
+        self._connection = AutopilotConnection(config.autopilot, clock, self._topics, EventLog(), opener)
 
     async def __aenter__(self) -> Self:
-        self._task = asyncio.create_task(self._hub.run(), name="autopilot")
+        self._task = asyncio.create_task(self._connection.run(), name="autopilot")
         for _ in range(round(WAIT_S * 20)):
             if self.state.attitude_t_ns:
                 return self

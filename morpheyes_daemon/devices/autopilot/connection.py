@@ -23,6 +23,7 @@ from morpheyes_daemon.devices.autopilot.override_echo import OverrideEcho
 from morpheyes_daemon.devices.autopilot.parameters import ParameterClient
 from morpheyes_daemon.devices.autopilot.telemetry import Telemetry
 from morpheyes_daemon.devices.autopilot.transmitter import Transmitter, may_relay
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceTimeoutError
 from morpheyes_daemon.messages.core import Event, VehicleState
@@ -89,6 +90,11 @@ class AutopilotConnection:
         self._greeted_ns = 0
         self._timesync_ns = 0
         self.refused_streams: list[str] = []
+
+    @classmethod
+    def from_config(cls, config: AutopilotConfig, context: DeviceContext) -> AutopilotConnection:
+        """Build the backend `mavlink`."""
+        return cls(config, context.clock, context.topics, context.events, context.opener)
 
     # -- what others hear ---------------------------------------------------------------------------------------
 
