@@ -5,10 +5,11 @@ Screen units (`_mm`, `_deg`) are allowed here and converted by the properties; e
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
 
 class Section(BaseModel):
@@ -75,12 +76,27 @@ class V4l2CameraConfig(CameraBase):
 class PluginConfig(Section):
     """A backend of another package, found through its entry point; it checks the `options` itself."""
 
+    group: ClassVar[str]
+    built_in: ClassVar[tuple[str, ...]]
+
     backend: str = Field(min_length=1, max_length=100)
     options: Any = Field(default_factory=dict, description="the backend's own settings")
+
+    @field_validator("backend")
+    @classmethod
+    def _installed(cls, backend: str) -> str:
+        installed = {point.name for point in entry_points(group=cls.group)}
+        if backend not in installed:
+            names = ", ".join(sorted({*cls.built_in, *installed}))
+            raise ValueError(f"there is no backend {backend!r}; installed are: {names}")
+        return backend
 
 
 class PluginCameraConfig(CameraBase, PluginConfig):
     """A camera of another package (entry point group `morpheyes.cameras`)."""
+
+    group = "morpheyes.cameras"
+    built_in = ("recording", "sim", "v4l2")
 
 
 def _backend_of(*built_in: str) -> Discriminator:
@@ -98,7 +114,7 @@ CameraConfig = Annotated[
     | Annotated[RecordingCameraConfig, Tag("recording")]
     | Annotated[V4l2CameraConfig, Tag("v4l2")]
     | Annotated[PluginCameraConfig, Tag("plugin")],
-    _backend_of("sim", "recording", "v4l2"),
+    _backend_of(*PluginCameraConfig.built_in),
 ]
 
 
@@ -139,6 +155,9 @@ class NoServoConfig(Section):
 class PluginServoConfig(PluginConfig):
     """A servo of another package (entry point group `morpheyes.servos`)."""
 
+    group = "morpheyes.servos"
+    built_in = ("none", "serial")
+
     motion: ServoMotion = ServoMotion()
 
 
@@ -146,7 +165,7 @@ ServoConfig = Annotated[
     Annotated[SerialServoConfig, Tag("serial")]
     | Annotated[NoServoConfig, Tag("none")]
     | Annotated[PluginServoConfig, Tag("plugin")],
-    _backend_of("serial", "none"),
+    _backend_of(*PluginServoConfig.built_in),
 ]
 
 
