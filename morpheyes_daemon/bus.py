@@ -26,6 +26,13 @@ from morpheyes_daemon.messages.safety import GateOutput, Health
 
 T = TypeVar("T")
 
+OnError = Callable[[Exception], None]
+
+
+def raise_it(error: Exception) -> None:
+    """Raise the error: what subscribers get where nobody has said what becomes of their mistakes."""
+    raise error
+
 
 class Latest(Generic[T]):
     """One slot; `publish` replaces what is there and wakes whoever waits."""
@@ -34,6 +41,7 @@ class Latest(Generic[T]):
         self.name = name
         self.count = 0
         self._value: T | None = None
+        self.on_error: OnError = raise_it
         self._waiting: list[asyncio.Future[None]] = []
         self._taps: list[Callable[[T], None]] = []
 
@@ -45,15 +53,14 @@ class Latest(Generic[T]):
         for future in waiting:
             if not future.done():
                 future.set_result(None)
-        for tap in self._taps:
-            tap(value)
+        call_each(self._taps, value, self.on_error)
 
     def get(self) -> T | None:
         """Return the newest value, None before the first."""
         return self._value
 
     def tap(self, callback: Callable[[T], None]) -> None:
-        """Call `callback` with every value; it must be quick and must not raise."""
+        """Call `callback` with every value; it must be quick. What it raises goes to `on_error`."""
         self._taps.append(callback)
 
     def reader(self) -> Reader[T]:
@@ -89,10 +96,24 @@ class Reader(Generic[T]):
         return value
 
 
+def call_each(callbacks: list[Callable[[T], None]], value: T, on_error: OnError) -> None:
+    """Call every callback, whatever those before it raised: a subscriber cannot raise into a publisher."""
+    for callback in callbacks:
+        try:
+            callback(value)
+        except Exception as error:  # noqa: BLE001 -- the subscriber's boundary
+            on_error(error)
+
+
 class EventLog:
-    """Events in order; handlers are called on the spot, so that the gate hears of an edge on reception."""
+    """Events in order; handlers are called on the spot, so that the gate hears of an edge on reception.
+
+    What a handler raises goes to `on_error`, and the others are called all the same. Without one it is raised, so that
+    tests and lockstep see it.
+    """
 
     def __init__(self) -> None:
+        self.on_error: OnError = raise_it
         self._handlers: list[Callable[[Event], None]] = []
 
     def subscribe(self, handler: Callable[[Event], None]) -> None:
@@ -101,8 +122,7 @@ class EventLog:
 
     def publish(self, event: Event) -> None:
         """Hand the event to every handler before returning."""
-        for handler in self._handlers:
-            handler(event)
+        call_each(self._handlers, event, self.on_error)
 
 
 class StickPulse:
@@ -149,3 +169,8 @@ class Topics:
     def create(cls) -> Topics:
         """Return a fresh set of empty topics."""
         return cls(**{f.name: Latest(f.name) for f in fields(cls)})
+
+    def on_error(self, handler: OnError) -> None:
+        """Hand what subscribers raise to `handler`."""
+        for f in fields(self):
+            getattr(self, f.name).on_error = handler

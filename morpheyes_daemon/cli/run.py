@@ -25,6 +25,7 @@ def command(
 
     from morpheyes_daemon.config.packaged import load_config
     from morpheyes_daemon.daemon.service import load_rig, real_time_runner, serve
+    from morpheyes_daemon.daemon.stdio import given_away
     from morpheyes_daemon.perception.pipeline import PipelineFactory
     from morpheyes_daemon.strategies.missions import find_mission, load_mission
 
@@ -33,8 +34,8 @@ def command(
         vehicle = vehicle.model_copy(update={"calibration": calibration})
     name = mission or vehicle.mission
     pipeline = PipelineFactory(vehicle, load_mission(name), load_rig(vehicle))
-    with real_time_runner() as runner:
+    with real_time_runner() as runner, given_away() as journal:
         try:
-            runner.run(serve(pipeline, find_mission(name).stem, lambda line: typer.echo(line, err=True)))
+            runner.run(serve(pipeline, find_mission(name).stem, journal))
         except asyncio.CancelledError:
             raise typer.Exit(130) from None

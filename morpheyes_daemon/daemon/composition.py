@@ -28,8 +28,8 @@ from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.devices.servo import Servo
 from morpheyes_daemon.doctor.standing_by import StopFindings
-from morpheyes_daemon.errors import DeviceError
-from morpheyes_daemon.messages.core import Perception, VehicleState
+from morpheyes_daemon.errors import DeviceError, mistake
+from morpheyes_daemon.messages.core import Event, Perception, VehicleState
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, Health
 from morpheyes_daemon.perception.craft import build_strategy
@@ -41,6 +41,9 @@ from morpheyes_daemon.supervisor.alarms import Alarms
 from morpheyes_daemon.supervisor.supervisor import Supervisor
 from morpheyes_daemon.tasks.status import StatusTelemetry
 from morpheyes_daemon.vision_worker.inline import VisionWorker
+
+DRAIN_S = 0.2
+"""How long a link that is being closed may take to send what was written; chosen: the release is 30 bytes."""
 
 
 @dataclass(slots=True)
@@ -112,9 +115,15 @@ class Daemon:
         topics.track.tap(self._status.on_track)
         topics.command.tap(self._status.on_command)
         events.subscribe(alarms.on_event)
+        self._subscriber_failed = False
+        self.connection.on_error = events.on_error = self._on_subscriber_error
+        topics.on_error(self._on_subscriber_error)
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Live until `stop` is set, then neutral, release and end. Every way out sends a release."""
+        """Live until `stop` is set, then neutral, release and end. Every way out sends a release on an open link.
+
+        Raises what ended the supervisor, after the release.
+        """
         await self._parts.worker.start()
         self.monitor.set_missing(None)
         running = asyncio.create_task(self.supervisor.run(), name="supervisor")
@@ -122,26 +131,54 @@ class Daemon:
         try:
             self.monitor.boot_done(self._clock.now_ns())
             await asyncio.wait({running, stopping}, return_when=asyncio.FIRST_COMPLETED)
-            if not running.done():
-                await self._leave(running)
+            await self._leave(running)
         finally:
-            self.monitor.release_now(Reason.SHUTDOWN, self._clock.now_ns())
+            self.release()
             for task in (running, stopping):
                 task.cancel()
             results = await asyncio.gather(running, stopping, return_exceptions=True)
+            await self._close_link()
             await self._parts.worker.close()
         failure = results[0]
         if isinstance(failure, Exception):
             raise failure
 
+    def release(self) -> None:
+        """Let go of the sticks for good, at once; whatever is broken, a release goes to the link."""
+        try:
+            self.monitor.release_now(Reason.SHUTDOWN, self._clock.now_ns())
+        finally:
+            self._output.release()
+
     async def _leave(self, running: asyncio.Task[None]) -> None:
-        """Neutral for a while if we hold the sticks, then the release, repeated by the gate."""
+        """Neutral for a while if we hold the sticks, then the release, repeated by the gate.
+
+        When the supervisor has died no task steps the monitor any more, and it is done here.
+        """
+        if running.done():
+            self.monitor.fault(Reason.TASK_DIED, self._clock.now_ns(), "supervisor")
         self.monitor.shutdown(self._clock.now_ns())
         held = self.topics.gate.get()
-        while not (self.monitor.let_go or running.done()):
+        while not self.monitor.let_go:
             await self._clock.sleep_until_ns(self._clock.now_ns() + S // 50)
+            if running.done():
+                self.monitor.step(self._clock.now_ns())
         if held is not None and held.action is not Action.SILENT:
             await self._clock.sleep_until_ns(self._clock.now_ns() + S // 5)
+
+    async def _close_link(self) -> None:
+        """Close the link and give what has been written a moment to go out."""
+        if self.connection.transmitter.link is not None:
+            self.connection.close()
+            await self._clock.sleep_until_ns(self._clock.now_ns() + round(DRAIN_S * S))
+
+    def _on_subscriber_error(self, error: Exception) -> None:
+        """A subscriber of ours raised: whatever it was for is not done, so the flight is not flown on."""
+        now_ns = self._clock.now_ns()
+        self.monitor.fault(Reason.TASK_DIED, now_ns, "subscriber")
+        if not self._subscriber_failed:
+            self._subscriber_failed = True
+            self.events.publish(Event(now_ns, "daemon", Reason.TASK_DIED, f"a subscriber failed: {mistake(error)}"))
 
     def _on_vehicle(self, vehicle: VehicleState) -> None:
         self.monitor.on_vehicle(vehicle, self._clock.now_ns())

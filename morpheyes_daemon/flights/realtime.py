@@ -11,7 +11,7 @@ import json
 import multiprocessing
 import tempfile
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, closing
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -30,13 +30,17 @@ from morpheyes_daemon.flights.referee import Verdict
 from morpheyes_daemon.flights.simulator_process import End, PilotAct, Ready, SimulatorJob, simulate
 from morpheyes_daemon.flights.stick_timing import StickIntervals, StickTiming
 from morpheyes_daemon.messages.core import Perception
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import GateOutput
+from morpheyes_daemon.observer.feed import Feed
+from morpheyes_daemon.observer.process import ObserverJob
+from morpheyes_daemon.observer.task import ObserverTask
 from morpheyes_daemon.perception.pipeline import PipelineFactory, VisionJob
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.reader import read_flight
-from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.report import draw_report
 from morpheyes_daemon.stereo.calibration_file import calibration_hash, read_calibration
+from morpheyes_daemon.supervisor.supervisor import Task
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 
 READY_LIMIT_S = 600.0
@@ -221,16 +225,26 @@ async def realtime_daemon(
             worker = parts.worker
             assert isinstance(worker, ProcessWorker)
             daemon = Daemon(config, plan.mission, parts, topics, events)
+            observer = ObserverTask(
+                _observer_job(plan, config, log, ready.scene_json, clock.now_ns()),
+                Feed(topics, events, clock),
+                clock,
+                lambda request: daemon.monitor.stop_requested(clock.now_ns()),
+            )
+            daemon.supervisor.add(Task("observer", observer.run, Reason.TASK_DIED, essential=False))
             watchers = Tally(topics, events), StickTiming(topics.gate)
             topics.gate.tap(simulator.tell)
-            with closing(_recorder(plan, config, daemon, log, ready.scene_json)):
-                stop = asyncio.Event()
-                running = asyncio.create_task(daemon.run(stop))
+            await observer.start()
+            stop = asyncio.Event()
+            running = asyncio.create_task(daemon.run(stop))
+            try:
+                yield RealtimeFlight(daemon, worker, simulator, running, *watchers)
+            finally:
+                stop.set()
                 try:
-                    yield RealtimeFlight(daemon, worker, simulator, running, *watchers)
-                finally:
-                    stop.set()
                     await running
+                finally:
+                    await observer.close()
 
 
 def device_config(plan: FlightPlan, ready: Ready, camera_address: str) -> VehicleConfig:
@@ -248,7 +262,7 @@ def device_config(plan: FlightPlan, ready: Ready, camera_address: str) -> Vehicl
     )
 
 
-def _recorder(plan: FlightPlan, config: VehicleConfig, daemon: Daemon, log: Path, scene_json: str) -> Recorder:
+def _observer_job(plan: FlightPlan, config: VehicleConfig, log: Path, scene_json: str, began_ns: int) -> ObserverJob:
     log.parent.mkdir(parents=True, exist_ok=True)
     for name in FILES:
         (log.parent / name).unlink(missing_ok=True)
@@ -260,5 +274,12 @@ def _recorder(plan: FlightPlan, config: VehicleConfig, daemon: Daemon, log: Path
         wall_s=wall_time_s(),
         scene=scene_json,
     )
-    rate_hz = plan.config.camera.rate_hz
-    return Recorder(daemon.topics, daemon.events, running_clock(), log, header, image_rate_hz=rate_hz, threaded=True)
+    return ObserverJob(
+        log=log,
+        header=header,
+        image_rate_hz=plan.config.camera.rate_hz,
+        page=None,
+        identity={},
+        journal=None,
+        began_ns=began_ns,
+    )

@@ -52,6 +52,10 @@ class StickOutput:
         """Take the autopilot's channel map; it counts from the next output on."""
         self._map = channel_map
 
+    def release(self) -> None:
+        """Send a release, whatever the gate last said; for the way out of a process in which it may have failed."""
+        self._send(RELEASE)
+
     def __call__(self, out: GateOutput) -> None:
         """Send one output of the gate."""
         if out.action is Action.RELEASE or self._map is None:
