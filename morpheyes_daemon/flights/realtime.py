@@ -19,7 +19,7 @@ from typing import Any
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, running_clock, stopwatch_s, wall_time_s
-from morpheyes_daemon.config.vehicle import AutopilotConfig, SerialServoConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import AutopilotConfig, DashboardConfig, SerialServoConfig, VehicleConfig
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.daemon.service import build_parts, real_time_runner
 from morpheyes_daemon.devices.family import DeviceContext
@@ -194,6 +194,7 @@ class RealtimeFlight:
     running: asyncio.Task[None]
     tally: Tally
     beat: StickTiming
+    observer: ObserverTask
 
     async def verdict(self) -> Verdict:
         """Wait for the judge; raises what ended the simulator or the daemon before."""
@@ -207,9 +208,16 @@ class RealtimeFlight:
 
 @asynccontextmanager
 async def realtime_daemon(
-    plan: FlightPlan, log: Path, autopilot: str | None, progress: Callable[[Progress], None]
+    plan: FlightPlan,
+    log: Path,
+    autopilot: str | None,
+    progress: Callable[[Progress], None],
+    page: DashboardConfig | None = None,
 ) -> AsyncIterator[RealtimeFlight]:
-    """Run simulator and daemon beside the body; at its end the daemon leaves in neutral, then release."""
+    """Run simulator and daemon beside the body; at its end the daemon leaves in neutral, then release.
+
+    `page` serves the dashboard, None none.
+    """
     clock, topics, events = running_clock(), Topics.create(), EventLog()
     with tempfile.TemporaryDirectory(prefix="morpheyes-") as place:
         address = f"unix:{place}/frames"
@@ -226,7 +234,7 @@ async def realtime_daemon(
             assert isinstance(worker, ProcessWorker)
             daemon = Daemon(config, plan.mission, parts, topics, events)
             observer = ObserverTask(
-                _observer_job(plan, config, log, ready.scene_json, clock.now_ns()),
+                _observer_job(plan, config, log, ready.scene_json, page),
                 Feed(topics, events, clock),
                 clock,
                 lambda request: daemon.monitor.stop_requested(clock.now_ns()),
@@ -238,7 +246,7 @@ async def realtime_daemon(
             stop = asyncio.Event()
             running = asyncio.create_task(daemon.run(stop))
             try:
-                yield RealtimeFlight(daemon, worker, simulator, running, *watchers)
+                yield RealtimeFlight(daemon, worker, simulator, running, *watchers, observer)
             finally:
                 stop.set()
                 try:
@@ -262,7 +270,9 @@ def device_config(plan: FlightPlan, ready: Ready, camera_address: str) -> Vehicl
     )
 
 
-def _observer_job(plan: FlightPlan, config: VehicleConfig, log: Path, scene_json: str, began_ns: int) -> ObserverJob:
+def _observer_job(
+    plan: FlightPlan, config: VehicleConfig, log: Path, scene_json: str, page: DashboardConfig | None
+) -> ObserverJob:
     log.parent.mkdir(parents=True, exist_ok=True)
     for name in FILES:
         (log.parent / name).unlink(missing_ok=True)
@@ -278,8 +288,8 @@ def _observer_job(plan: FlightPlan, config: VehicleConfig, log: Path, scene_json
         log=log,
         header=header,
         image_rate_hz=plan.config.camera.rate_hz,
-        page=None,
-        identity={},
+        page=page,
+        identity={"mission": plan.mission_name, "seed": str(plan.scenario.seed), "calibration": str(plan.calibration)},
         journal=None,
-        began_ns=began_ns,
+        began_ns=running_clock().now_ns(),
     )

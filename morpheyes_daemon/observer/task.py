@@ -56,6 +56,11 @@ class ObserverTask:
             pulse.beat()
             await ticker.wait()
 
+    @property
+    def pid(self) -> int | None:
+        """Process id of the present observer, None while there is none."""
+        return self._process.pid if self._process is not None else None
+
     async def start(self) -> None:
         """Start the observer before the tasks run, so that nothing goes untold."""
         if not self.feed.channel.connected:
