@@ -28,6 +28,7 @@ class Reason(StrEnum):
     MISSION_REFUSED = "mission_refused", 5, "the mission judged the task not safely possible"
     SHUTDOWN = "shutdown", 6, "the daemon was asked to stop"
     RECOVERED = "recovered", 7, "the missing input is back"
+    PRIORITY_KEPT = "priority_kept", 8, "a process could not lower its priority"
 
     # the pilot
     SWITCH_OFF = "switch_off", 20, "the pilot's switch is off"
