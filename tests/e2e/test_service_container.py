@@ -343,6 +343,7 @@ def fly_and_stop(service: Service, vehicle: Vehicle) -> None:
 def engage(service: Service, vehicle: Vehicle) -> None:
     """Hand the sticks over, and wait until they ask for a motion."""
     service.status("standby")
+    vehicle.overrides.clear()
     vehicle.ask("engage")
     until(lambda: vehicle.deflected, 30.0, service.journal)
 
