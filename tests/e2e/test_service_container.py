@@ -29,7 +29,16 @@ import pytest
 from morpheyes_daemon.messages.core import Perception
 from morpheyes_daemon.recorder.reader import read_flight
 from morpheyes_daemon.stereo.calibration_file import write_calibration
-from tests.support.booted_debian import Container, NoContainerError, booted, make_root, missing, until
+from tests.support.booted_debian import (
+    Container,
+    NoContainerError,
+    booted,
+    make_root,
+    missing,
+    process_status,
+    until,
+)
+from tests.support.sandbox_probe import WANTED
 
 pytest.importorskip("numba")
 
@@ -88,11 +97,12 @@ class Vehicle:
     @property
     def deflected(self) -> bool:
         """Whether the last override asks for a motion."""
-        return bool(self.overrides) and self.overrides[-1] != RELEASE and not neutral(self.overrides[-1])
+        return bool(self.overrides) and kind_of(self.overrides[-1]) == "deflected"
 
 
-def neutral(sticks: list[int]) -> bool:
-    return all(abs(width - 1500) <= 1 for width in sticks)
+def kind_of(sticks: list[int]) -> str:
+    neutral = all(abs(width - 1500) <= 1 for width in sticks)
+    return "release" if sticks == RELEASE else "neutral" if neutral else "deflected"
 
 
 @contextmanager
@@ -207,7 +217,7 @@ class Service:
     def to_here(self, inside: int) -> int:
         """A process of the container by its number there."""
         for folder in Path("/proc").iterdir():
-            numbers = _status(folder).get("NSpid", "").split() if folder.name.isdigit() else []
+            numbers = process_status(folder).get("NSpid", "").split() if folder.name.isdigit() else []
             same = len(numbers) > 1 and int(numbers[-1]) == inside
             if same and (folder / "root").samefile(self.container.inside):
                 return int(folder.name)
@@ -236,14 +246,6 @@ class Service:
         return max((self.container.inside / LOGS / "flights").glob("*.mcap"), key=lambda path: path.stat().st_mtime)
 
 
-def _status(folder: Path) -> dict[str, str]:
-    try:
-        lines = (folder / "status").read_text().splitlines()
-    except OSError:
-        return {}
-    return dict(line.split(":\t", 1) for line in lines if ":\t" in line)
-
-
 @pytest.fixture
 def service(installed: Container, vehicle: Vehicle) -> Iterator[Service]:
     shown = Service(installed)
@@ -257,7 +259,10 @@ def test_ready_status_worker_depth_and_folders(service: Service) -> None:
     service.status("standby")
     until(lambda: service.worker != 0, 20.0)
     for pid, niceness in ((service.pid, -10), (service.worker, 0)):
-        assert _status(Path(f"/proc/{pid}"))["Uid"].split()[0] == service.container.run("id", "-u", "morpheyes").strip()
+        assert (
+            process_status(Path(f"/proc/{pid}"))["Uid"].split()[0]
+            == service.container.run("id", "-u", "morpheyes").strip()
+        )
         assert os.getpriority(os.PRIO_PROCESS, pid) == niceness
     service.stop()
     assert service["Result"] == "success"
@@ -371,37 +376,6 @@ def test_every_sandbox_rule_is_in_force(service: Service) -> None:
     assert set(outcome["groups"]) == {"morpheyes", "video", "dialout"}
 
 
-WANTED = {
-    "a file in /etc": "EROFS",
-    "a file in /usr": "EROFS",
-    "a file in /var/lib/morpheyes": "done",
-    "a file in /var/log/morpheyes": "done",
-    "a file in /var/cache/morpheyes": "done",
-    "the names in /home": "EACCES",
-    "a foreign process": "ENOENT",
-    "a packet socket": "EAFNOSUPPORT EPERM",
-    "a netlink socket": "EAFNOSUPPORT",
-    "to loopback": "done",
-    "to a local network": "done",
-    "to the internet": "EPERM",
-    "a Teensy plugged in later": "ENXIO",
-    "a USB serial port plugged in later": "ENXIO",
-    "a camera plugged in later": "ENXIO",
-    "a disk": "EPERM",
-    "lower priority": "done",
-    "higher priority": "EPERM EACCES",
-    "real-time scheduling": "EPERM",
-    "writable code": "EPERM",
-    "a new namespace": "EPERM",
-    "a mount": "EPERM",
-    "another user": "EPERM",
-    "a set-user-id file": "EPERM",
-    "another host name": "EPERM",
-    "another time": "EPERM",
-}
-"""What comes of trying; ENXIO is what the kernel says of a device without a driver that one may open."""
-
-
 def test_an_upgrade_leaves_it_running_and_keeps_the_configuration(service: Service) -> None:
     service.start(RECORDED)
     service.status("standby")
@@ -428,7 +402,3 @@ def test_removal_ends_it_in_order_and_purge_leaves_nothing(service: Service) -> 
     for place in (STATE, LOGS, CONFIG.parent, Path("var/cache/morpheyes"), Path("usr/lib/morpheyes")):
         assert not (inside / place).exists()
     assert service["LoadState"] == "not-found"
-
-
-def kind_of(sticks: list[int]) -> str:
-    return "release" if sticks == RELEASE else "neutral" if neutral(sticks) else "deflected"

@@ -132,3 +132,12 @@ def _leader(pid: int) -> int:
     except OSError:
         pass  # one of them has just ended
     return 0
+
+
+def process_status(folder: Path) -> dict[str, str]:
+    """Return /proc/PID/status, empty when the process is gone."""
+    try:
+        lines = (folder / "status").read_text().splitlines()
+    except OSError:
+        return {}
+    return dict(line.split(":\t", 1) for line in lines if ":\t" in line)

@@ -88,6 +88,37 @@ ATTEMPTS: dict[str, Callable[[], object]] = {
 }
 
 
+WANTED = {
+    "a file in /etc": "EROFS",
+    "a file in /usr": "EROFS",
+    "a file in /var/lib/morpheyes": "done",
+    "a file in /var/log/morpheyes": "done",
+    "a file in /var/cache/morpheyes": "done",
+    "the names in /home": "EACCES",
+    "a foreign process": "ENOENT",
+    "a packet socket": "EAFNOSUPPORT EPERM",
+    "a netlink socket": "EAFNOSUPPORT",
+    "to loopback": "done",
+    "to a local network": "done",
+    "to the internet": "EPERM",
+    "a Teensy plugged in later": "ENXIO",
+    "a USB serial port plugged in later": "ENXIO",
+    "a camera plugged in later": "ENXIO",
+    "a disk": "EPERM",
+    "lower priority": "done",
+    "higher priority": "EPERM EACCES",
+    "real-time scheduling": "EPERM",
+    "writable code": "EPERM",
+    "a new namespace": "EPERM",
+    "a mount": "EPERM",
+    "another user": "EPERM",
+    "a set-user-id file": "EPERM",
+    "another host name": "EPERM",
+    "another time": "EPERM",
+}
+"""What comes of trying; ENXIO is what the kernel says of a device without a driver that one may open."""
+
+
 def outcome(attempt: Callable[[], object]) -> str:
     """Return `done` or the name of the error."""
     try:
