@@ -72,6 +72,9 @@ def build_parts(
     def on_worker_death(text: str) -> None:
         events.publish(Event(clock.now_ns(), "vision", Reason.WORKER_LOST, text))
 
+    def on_worker_remark(text: str) -> None:
+        events.publish(Event(clock.now_ns(), "vision", Reason.PRIORITY_KEPT, text))
+
     log_hz = config.recorder.image_rate_hz if config.recorder.images else 0.0
     log_hz = config.camera.rate_hz if film else log_hz
     page_hz = DASHBOARD_IMAGE_HZ if config.dashboard.enabled else 0.0
@@ -80,7 +83,9 @@ def build_parts(
         camera=build_camera(config.camera, context),
         servo=build_servo(config.servo, context),
         opener=context.opener,
-        worker=ProcessWorker(pipeline, job_timeout_s=JOB_TIMEOUT_S, on_idle_death=on_worker_death),
+        worker=ProcessWorker(
+            pipeline, job_timeout_s=JOB_TIMEOUT_S, on_idle_death=on_worker_death, on_remark=on_worker_remark
+        ),
         image_rate_hz=max(log_hz, page_hz),
         tell=tell,
     )

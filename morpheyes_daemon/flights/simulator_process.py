@@ -119,7 +119,8 @@ class Heard:
 def simulate(job: SimulatorJob, pipe: Connection) -> None:
     """The process's whole life."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group; the parent decides
-    os.nice(NICENESS)
+    with contextlib.suppress(OSError):  # where that is refused it renders at the daemon's priority
+        os.nice(NICENESS)
     try:
         asyncio.run(_simulate(job, pipe))
     except MorphEyesError as error:

@@ -29,6 +29,7 @@ class Reason(StrEnum):
     SHUTDOWN = "shutdown", 6, "the daemon was asked to stop"
     RECOVERED = "recovered", 7, "the missing input is back"
     STOP_REQUESTED = "stop_requested", 8, "somebody asked for a stop on the page"
+    PRIORITY_KEPT = "priority_kept", 9, "a process could not lower its priority"
 
     # the pilot
     SWITCH_OFF = "switch_off", 20, "the pilot's switch is off"

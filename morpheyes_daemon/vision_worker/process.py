@@ -47,7 +47,8 @@ class ProcessWorker(Generic[Job, Result]):
     """A `VisionWorker` that builds `factory()` in another process and calls its `perceive` there.
 
     `factory` and what it needs must be picklable, jobs and results too. A MorphEyesError raised there is raised here
-    as it is, anything else as WorkerFailed. `on_idle_death` hears of a death that no job would tell of.
+    as it is, anything else as WorkerFailed. `on_idle_death` hears of a death that no job would tell of, `on_remark`
+    once of what a process could not do that it can do without.
     """
 
     def __init__(
@@ -58,10 +59,12 @@ class ProcessWorker(Generic[Job, Result]):
         start_timeout_s: float = 60.0,
         niceness: int = 10,
         on_idle_death: Callable[[str], None] = lambda text: None,
+        on_remark: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._factory, self._niceness = factory, niceness
         self._job_timeout_s, self._start_timeout_s = job_timeout_s, start_timeout_s
-        self._on_idle_death = on_idle_death
+        self._on_idle_death, self._on_remark = on_idle_death, on_remark
+        self._remarked = ""
         self._turn = asyncio.Lock()
         self._child: _Child | None = None
         self._starting: asyncio.Task[_Child] | None = None
@@ -129,7 +132,7 @@ class ProcessWorker(Generic[Job, Result]):
         child = _Child()
         try:
             async with asyncio.timeout(self._start_timeout_s):
-                await child.start(self._factory, self._niceness)
+                self._remark(await child.start(self._factory, self._niceness))
         except (EOFError, ConnectionError):
             raise WorkerLost(f"The vision worker died while starting ({await child.end()}).") from None
         except TimeoutError:
@@ -142,6 +145,12 @@ class ProcessWorker(Generic[Job, Result]):
             if self._child is not child:
                 child.kill()
                 await child.close()
+
+    def _remark(self, text: str) -> None:
+        """Pass on what a process said of its start, unless the one before it said the same."""
+        if text and text != self._remarked:
+            self._on_remark(text)
+        self._remarked = text
 
     def _mourn(self, child: _Child) -> None:
         if self._child is child and not self._turn.locked() and not self._closed:
@@ -188,8 +197,8 @@ class _Child:
         self._callback: Callable[[], None] | None = None
         self._started = False
 
-    async def start(self, factory: Callable[[], Any], niceness: int) -> None:
-        """Start the process and wait until it is ready; EOFError when it dies, or what it raised."""
+    async def start(self, factory: Callable[[], Any], niceness: int) -> str:
+        """Start the process, wait until it is ready and return its remark; EOFError when it dies, or what it raised."""
         ours, theirs = socket.socketpair()
         with theirs:
             socket.send_fds(ours, [_JOB], [self._jobs.fd, self._results.fd])
@@ -203,7 +212,8 @@ class _Child:
         self._started = True
         asyncio.get_running_loop().add_reader(self.process.sentinel, self._on_exited)
         self._awaited = 1
-        await self._answer()
+        remark: str = await self._answer()
+        return remark
 
     def on_exit(self, callback: Callable[[], None]) -> None:
         """Call back when the process ends, at once when it already has."""
@@ -284,14 +294,15 @@ class _Child:
 def serve(factory: Callable[[], Perceiver[Any, Any]], link: socket.socket, niceness: int) -> None:
     """The worker's whole life: build the object, answer jobs, end with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group; the parent decides
-    os.nice(niceness)
+    remark = _give_way(niceness)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _, (jobs_fd, results_fd), _, _ = socket.recv_fds(link, 1, 2)
     jobs, results = Mailbox(jobs_fd), Mailbox(results_fd)
     built: list[Perceiver[Any, Any]] = []
 
-    def build() -> None:
+    def build() -> str:
         built.append(factory())
+        return remark
 
     _reply(link, results, build)
     try:
@@ -299,6 +310,18 @@ def serve(factory: Callable[[], Perceiver[Any, Any]], link: socket.socket, nicen
             _reply(link, results, lambda: built[0].perceive(jobs.take()))
     except ConnectionError:
         return  # the parent died while it waited for an answer
+
+
+def _give_way(niceness: int) -> str:
+    """Lower the priority of this process; a service manager's filter may refuse that, which is said and lived with."""
+    try:
+        os.nice(niceness)
+    except OSError as error:
+        return (
+            f"The vision worker could not lower its priority by {niceness} ({error.strerror}) and runs at that of the "
+            "daemon; allow the system call setpriority in the unit."
+        )
+    return ""
 
 
 def _reply(link: socket.socket, results: Mailbox, work: Callable[[], Any]) -> None:

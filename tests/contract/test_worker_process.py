@@ -62,6 +62,43 @@ async def test_it_computes_elsewhere_and_nicely() -> None:
     assert gone(pid)
 
 
+UNDER_A_FILTER = """
+import asyncio, os
+from morpheyes_daemon.vision_worker.process import ProcessWorker
+from tests.safety.scapegoat import Order, Scapegoat
+
+async def main():
+    remarks = []
+    worker = ProcessWorker(Scapegoat, job_timeout_s=30.0, niceness=7, on_remark=remarks.append)
+    await worker.start()
+    assert await worker.compute(Order("nice")) == os.getpriority(os.PRIO_PROCESS, 0)
+    os.kill(worker.pid, 9)
+    while worker.restarts == 0:
+        await asyncio.sleep(0.01)
+    assert await worker.compute(Order("count")) == 1
+    await worker.close()
+    print(*remarks, sep="\\n")
+
+if __name__ == "__main__":
+    asyncio.run(main())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="seccomp is Linux's")
+def test_a_refused_priority_is_said_once_and_the_worker_works(tmp_path: Path) -> None:
+    """A unit's SystemCallFilter=~@resources answers setpriority with EPERM."""
+    script, root = tmp_path / "under_a_filter.py", Path(__file__).parents[2]
+    script.write_text(UNDER_A_FILTER)
+    done = subprocess.run(
+        [sys.executable, root / "tests/support/refused_call.py", "setpriority", sys.executable, script],
+        capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": str(root)},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    (remark,) = done.stdout.splitlines()
+    assert "Operation not permitted" in remark
+    assert "setpriority" in remark
+
+
 async def test_big_frames_pass_both_ways_unchanged() -> None:
     noise = np.random.default_rng(1)
     async with worker() as w:
