@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig, VehicleConfig
-from morpheyes_daemon.control.baseline import BaselineModel, FixedBaseline
+from morpheyes_daemon.control.baseline import BaselineModel, baseline_model
 from morpheyes_daemon.control.baseline_planner import BaselinePlanner
 from morpheyes_daemon.control.governor import Governor
 from morpheyes_daemon.control.limits import governor_limits, velocity_tuning
@@ -98,9 +98,8 @@ class Daemon:
         self.monitor = SafetyMonitor(self.gate, SafetyMonitorLimits.of(config), self._on_transition)
         self.control: StickController | None = None
         self._governor = Governor(governor_limits(config))
-        self._model = BaselineModel(config.servo.motion) if not isinstance(config.servo, NoServoConfig) else None
-        fixed_m = config.baseline_range_m[0]
-        self._where = self._model or FixedBaseline(fixed_m)
+        self._where = baseline_model(config)
+        self._model = self._where if isinstance(self._where, BaselineModel) else None
         self.connection.on_vehicle(self._on_vehicle)
         topics.track.tap(self._tell_track)
         events.subscribe(self._on_event)
@@ -246,7 +245,7 @@ class Daemon:
         lost = event.reason in ALARMS
         self.monitor.set_missing(event.reason if lost else None, "servo")
         if lost and self._model is not None:
-            self._model.doubt(self._model.at(event.t_ns).target_m, event.t_ns)
+            self._model.on_unconfirmed(self._model.at(event.t_ns).target_m, event.t_ns)
 
     def on_baseline_known(self, known: bool) -> None:
         """Until the eyes are known to be somewhere, neither depth nor the checks of their pictures mean anything."""

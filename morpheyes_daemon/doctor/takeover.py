@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 from morpheyes_daemon.clock import MS, Clock, S, Ticker
 from morpheyes_daemon.config.vehicle import AutopilotConfig
-from morpheyes_daemon.control.loiter import LoiterModel, Widths
+from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import VehicleState
+from morpheyes_daemon.messages.safety import Widths
 from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride
 
 PATIENCE_S = 60.0

@@ -52,6 +52,6 @@ async def baseline(
 
 async def _move(servo: Servo, model: BaselineModel, target_m: float, clock: Clock) -> None:
     """Between sending a target and its acknowledgement the eyes may have begun to move, or not."""
-    model.send(target_m, clock.now_ns())
+    model.on_sent(target_m, clock.now_ns())
     await servo.move(target_m)
-    model.command(target_m, clock.now_ns())
+    model.on_acknowledged(target_m, clock.now_ns())

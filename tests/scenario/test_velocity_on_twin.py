@@ -10,7 +10,7 @@ import pytest
 
 from morpheyes_daemon.clock import MS, S, Ticker, run_virtual
 from morpheyes_daemon.control.loiter import LoiterModel
-from morpheyes_daemon.control.velocity import VelocityController
+from morpheyes_daemon.control.velocity import VelocityController, VelocitySetpoint
 from morpheyes_daemon.devices.link import MemoryLink
 from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.crew.scripted import GroundCrew
@@ -41,7 +41,7 @@ class Flight:
             await ticker.wait()
             now_ns = clock.now_ns()
             state = self.bench.vehicle
-            s = self.controller.step(now_ns, (north_m_s, 0.0, 0.0), 0.0, HEIGHT_M, state)
+            s = self.controller.step(VelocitySetpoint((north_m_s, 0.0, 0.0), 0.0, HEIGHT_M), state, now_ns)
             self.output(ChannelOverride(self.model.channels((s.roll_us, s.pitch_us, s.throttle_us, s.yaw_us))))
             truth = self.bench.twin.truth_at(now_ns - 20 * MS)
             speeds.append(truth.v_ned_m_s[0])

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Section
-from morpheyes_daemon.control.baseline import baseline_for
+from morpheyes_daemon.control.baseline import baseline_law
 from morpheyes_daemon.control.pid import Pid, PidGains
 from morpheyes_daemon.messages.core import Intent, MissionCommand, VehicleState
 from morpheyes_daemon.messages.mission import Observation
@@ -338,7 +338,7 @@ class Forest(Strategy):
             v_ned_m_s=v_ned_m_s,
             yaw_rad=yaw_rad,
             height_m=self._height_m,
-            baseline_m=baseline_for(self._z_close_m, self.parameters.baseline_gain, self.craft.baseline_range_m),
+            baseline_m=baseline_law(self._z_close_m, self.parameters.baseline_gain, self.craft.baseline_range_m),
             clear_m=clear_m,
             measured_ns=observation.vehicle.position_t_ns,
             p_measured_ned_m=observation.vehicle.p_ned_m,

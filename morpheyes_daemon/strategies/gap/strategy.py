@@ -16,7 +16,7 @@ from enum import StrEnum
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.control.baseline import baseline_for
+from morpheyes_daemon.control.baseline import baseline_law
 from morpheyes_daemon.messages.core import Intent, Line, MissionCommand
 from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
@@ -226,7 +226,7 @@ class Gap(Strategy):
         """Go to the stand-off and follow the opening there."""
         line = Line(
             observation.now_ns, _three(start), _three(opening.v_m_s), _three(opening.a_m_s2), HOLD_1_S,
-            most_m_s=self.parameters.approach_m_s,
+            max_m_s=self.parameters.approach_m_s,
         )  # fmt: skip
         return self._command(
             observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(),
@@ -315,7 +315,9 @@ class Gap(Strategy):
         left_s = self._crossing.left_s(range_m, float(np.array(vehicle.v_ned_m_s) @ ahead), now_ns)
         opening = self._track.at(now_ns + round(left_s * S))
         place = opening.p_m - left_s * opening.v_m_s  # a straight way that meets it as it moves then
-        line = Line(now_ns, _three(place), _three(opening.v_m_s), gain_1_s=RUN_1_S, integral_1_s2=RUN_1_S2)
+        line = Line(
+            now_ns, _three(place), _three(opening.v_m_s), gain_1_s=RUN_1_S, integral_1_s2=RUN_1_S2, fast_response=True
+        )
         return self._command(
             observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(), v_ned_m_s=_three(v),
             clear_m=max(0.0, beyond_m - NOSE_M), z_m=beyond_m, contour_m=range_m,
@@ -359,7 +361,7 @@ class Gap(Strategy):
         z_c_m = z_m if math.isnan(contour_m) else contour_m
         low, high = self.craft.baseline_range_m
         following = self._phase is Phase.APPROACH
-        wanted_m = baseline_for(z_c_m, self.parameters.baseline_gain, (low, high))
+        wanted_m = baseline_law(z_c_m, self.parameters.baseline_gain, (low, high))
         if math.isnan(z_c_m):
             wanted_m = observation.baseline_m  # eyes that go to and fro lose their scale
         baseline_m = wanted_m if following else low

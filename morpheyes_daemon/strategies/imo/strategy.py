@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.control.baseline import baseline_for
+from morpheyes_daemon.control.baseline import baseline_law
 from morpheyes_daemon.messages.core import Intent, MissionCommand, Track, VehicleState
 from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
@@ -222,7 +222,7 @@ class Imo(Strategy):
             v_ned_m_s=(float(velocity[0]), float(velocity[1]), 0.0),
             yaw_rad=self._yaw_rad,
             height_m=self._height_m,
-            baseline_m=baseline_for(self._depth_m, self.parameters.baseline_gain, self.craft.baseline_range_m),
+            baseline_m=baseline_law(self._depth_m, self.parameters.baseline_gain, self.craft.baseline_range_m),
             clear_m=clear_m,
             measured_ns=observation.vehicle.position_t_ns,
             p_measured_ned_m=observation.vehicle.p_ned_m,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.control.baseline import SPEED_TOLERANCE, BaselineModel
-from morpheyes_daemon.control.baseline_planner import TURN_SIGMA_M, WINDOW_NS, BaselinePlanner
+from morpheyes_daemon.control.baseline_planner import DUTY_WINDOW_NS, REVERSAL_SIGMA_M, BaselinePlanner
 from morpheyes_daemon.simulation.servo.teensy import ServoTruth, TeensyTwin
 from morpheyes_daemon.wire.servo import SetTarget, encode
 from tests.support.hand_clock import HandClock
@@ -33,8 +33,8 @@ class Rig:
         for _ in range(round(seconds * 5)):
             target_m = self.planner.plan(wanted_m, self.model.at(self.t_ns))
             if target_m is not None:
-                self.model.send(target_m, self.t_ns)
-                self.model.command(target_m, self.t_ns + ACKNOWLEDGED_NS)
+                self.model.on_sent(target_m, self.t_ns)
+                self.model.on_acknowledged(target_m, self.t_ns + ACKNOWLEDGED_NS)
                 self.commands.append((self.t_ns, target_m))
             self.t_ns += 200 * MS
 
@@ -107,7 +107,7 @@ def test_no_number_moves_nothing() -> None:
 @pytest.mark.parametrize("perhaps_m", [0.1, 0.195])
 def test_a_servo_that_lost_its_place_is_commanded_again(perhaps_m: float) -> None:
     rig = Rig().settled_at(0.2)
-    rig.model.doubt(perhaps_m, rig.t_ns)
+    rig.model.on_unconfirmed(perhaps_m, rig.t_ns)
     rig.t_ns += 10 * S
     rig.want(0.2, 8.0)
     assert rig.commands[0][1] == pytest.approx(0.201)
@@ -164,7 +164,7 @@ def test_wishes_that_go_to_and_fro_leave_little_doubt(near_m: float, beats: int)
             rig.want(wanted_m)
             sigmas_m.append(rig.model.at(rig.t_ns).sigma_m)
     of_the_stroke_m = 2 * SPEED_TOLERANCE * stroke_m / math.sqrt(12)
-    assert max(sigmas_m) < of_the_stroke_m + 3 * TURN_SIGMA_M
+    assert max(sigmas_m) < of_the_stroke_m + 3 * REVERSAL_SIGMA_M
     assert sum(sigmas_m) / len(sigmas_m) < 0.005
 
 
@@ -181,6 +181,6 @@ def test_restless_wishes_leave_the_true_servo_at_rest_for_most_of_the_time() -> 
             twin.receive(encode(SetTarget(beat % 256, target_m)))
         clock.t_ns = rig.t_ns
         running.append(abs(twin.baseline_at(rig.t_ns) - twin.baseline_at(rig.t_ns - step_ns)) > 0.5e-3)
-    window = WINDOW_NS // step_ns
+    window = DUTY_WINDOW_NS // step_ns
     assert max(sum(running[i : i + window]) / window for i in range(0, len(running) - window, 25)) <= DUTY
     assert sum(running) / len(running) > DUTY / 2  # the budget is used, not hoarded

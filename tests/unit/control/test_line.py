@@ -5,11 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from morpheyes_daemon.control.path_following import (
-    ANSWER_S,
     CLIMB_GAIN_1_S,
-    CLIMB_MOST_M_S,
     LEAN_LAG_S,
-    MISSED_MOST_M_S,
+    LOOKAHEAD_S,
+    MAX_CLIMB_M_S,
+    MAX_INTEGRAL_M_S,
     PathFollower,
 )
 from morpheyes_daemon.messages.core import Intent, Line, MissionCommand, VehicleState
@@ -54,7 +54,7 @@ def test_a_moving_line_is_led_by_the_lag_of_the_lean():
 def test_on_its_way_back_it_is_held_against_where_it_will_be():
     line, back = Line(0, (7.0, 0.0, -1.5), gain_1_s=2.0), (3.0, -0.3, 0.0)
     vehicle = VehicleState(p_ned_m=(1.0, 0.2, -1.5), v_ned_m_s=back)
-    assert wanted_velocity(command(line), vehicle, 0)[1] == pytest.approx(-2.0 * (0.2 - 0.3 * ANSWER_S))
+    assert wanted_velocity(command(line), vehicle, 0)[1] == pytest.approx(-2.0 * (0.2 - 0.3 * LOOKAHEAD_S))
 
 
 def test_a_quick_line_is_climbed_to_no_quicker_than_climbing_answers():
@@ -70,15 +70,15 @@ def test_what_stays_missing_is_asked_for_more_and_more():
     assert last == pytest.approx(-0.1 - 3.0 * 0.05 * 49 / 50)
     for k in range(51, 1000):
         last = keeper.wanted_velocity(order, vehicle, k * S // 50)[1]
-    assert last == pytest.approx(-0.1 - MISSED_MOST_M_S)
+    assert last == pytest.approx(-0.1 - MAX_INTEGRAL_M_S)
     keeper.reset()
     assert keeper.wanted_velocity(order, vehicle, 1000 * S // 50)[1] == pytest.approx(-0.1)
 
 
 @given(st.tuples(*[st.floats(-50, 50)] * 3), st.tuples(*[st.floats(-50, 50)] * 3), st.floats(0.1, 3.0))
 def test_the_way_back_is_bounded(place, here, most):
-    line = Line(0, place, gain_1_s=2.0, most_m_s=most)
+    line = Line(0, place, gain_1_s=2.0, max_m_s=most)
     vn, ve, vd = wanted_velocity(command(line), VehicleState(p_ned_m=here), 0)
     assert vn == pytest.approx(3.0)
     assert abs(ve) <= most + 1e-9
-    assert abs(vd) <= CLIMB_MOST_M_S + 1e-9
+    assert abs(vd) <= MAX_CLIMB_M_S + 1e-9

@@ -10,7 +10,7 @@ import pytest
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.control.loiter import LoiterModel
-from morpheyes_daemon.control.velocity import VelocityController, VelocityTuning, height_above_ground_m
+from morpheyes_daemon.control.velocity import VelocityController, VelocitySetpoint, VelocityTuning, height_above_ground_m
 from morpheyes_daemon.messages.core import Sticks, VehicleState
 from tests.support.copter_parameters import copter_parameters
 from tests.support.loiter_plant import LoiterPlant
@@ -52,7 +52,7 @@ class Flight:
                     v_ned_m_s=(v[0] + noise.gauss(0, NOISE_M_S), v[1] + noise.gauss(0, NOISE_M_S), 0.0),
                 )
                 north, east, heading = profile(ms / 1000)
-                s = self.controller.step(now, (north, east, 0.0), heading, 1.5, state)
+                s = self.controller.step(VelocitySetpoint((north, east, 0.0), heading, 1.5), state, now)
                 self.sticks.append(s)
             plant.step_ms(
                 -self.model.pitch.deflection(s.pitch_us),
@@ -138,7 +138,7 @@ def test_lean_stays_bounded() -> None:
 def test_coast_keeps_pitch_and_roll_neutral() -> None:
     model = LoiterModel.from_parameters(copter_parameters())
     state = VehicleState(p_ned_m=(0, 0, -1.0), v_ned_m_s=(1.0, 0.5, 0.0))
-    s = VelocityController(model).step(S, (3.0, 0.0, 0.0), 0.5, 1.5, state, coast=True)
+    s = VelocityController(model).step(VelocitySetpoint((3.0, 0.0, 0.0), 0.5, 1.5, coast=True), state, S)
     assert (s.roll_us, s.pitch_us) == (1500, 1500)
     assert s.yaw_us > 1520
     assert s.throttle_us > 1600
@@ -148,7 +148,8 @@ def test_height_error_moves_the_throttle_beyond_its_dead_band_only_when_it_matte
     controller = VelocityController(LoiterModel.from_parameters(copter_parameters()))
 
     def throttle(height_m: float) -> int:
-        return controller.step(S, (0.0, 0.0, 0.0), None, 1.5, VehicleState(p_ned_m=(0, 0, -height_m))).throttle_us
+        vehicle = VehicleState(p_ned_m=(0, 0, -height_m))
+        return controller.step(VelocitySetpoint((0.0, 0.0, 0.0), height_m=1.5), vehicle, S).throttle_us
 
     assert throttle(1.46) == 1500
     assert throttle(1.0) > 1600
