@@ -8,7 +8,8 @@ import pytest
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import Intent, MissionCommand, VehicleState
 from morpheyes_daemon.messages.mission import Observation
-from morpheyes_daemon.strategies.forest.strategy import Forest, ForestParameters, Goal
+from morpheyes_daemon.strategies.forest.parameters import ForestParameters, Goal
+from morpheyes_daemon.strategies.forest.strategy import Forest
 from morpheyes_daemon.strategies.obstacles.polar_profile import ObstacleProfile
 from tests.support.seen_from_above import CRAFT, SUMMARY, blind, empty_profile, with_points
 

@@ -7,13 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.forest.strategy import ForestParameters
+from morpheyes_daemon.strategies.forest.parameters import ForestParameters
 from morpheyes_daemon.strategies.forest.turn_feasibility import (
-    MOST_TURN_RAD,
+    MAX_TURN_RAD,
     RESPONSE_S,
-    homing_m_s,
-    slim_margin_m,
-    turnable_share,
+    Turn,
+    feasible_speed_share,
+    goal_approach_m_s,
+    path_margin_m,
 )
 from morpheyes_daemon.transforms import wrap_rad
 
@@ -25,19 +26,19 @@ AHEAD, ASIDE = np.array([3.0, 0.0]), np.array([0.0, 3.0])
 def share(
     frame_period_s: float, obstacles: np.ndarray, before: np.ndarray, wanted: np.ndarray, braking_s: float = 0.0
 ) -> float:
-    return turnable_share(obstacles, before, wanted, 0.4, braking_s, frame_period_s)
+    return feasible_speed_share(obstacles, Turn(before, wanted, braking_s, frame_period_s), 0.4)
 
 
 def nearest_m(frame_period_s: float, course_rad: float, speed_m_s: float) -> float:
     """How near to its goal, 5 m to the north, a point comes that turns as slowly as decisions so far apart let it."""
-    rate_rad_s = MOST_TURN_RAD / (2.0 * frame_period_s + RESPONSE_S)
+    rate_rad_s = MAX_TURN_RAD / (2.0 * frame_period_s + RESPONSE_S)
     place, nearest, dt_s = np.array([-5.0, 0.0]), math.inf, 0.02
     for _ in range(3000):
         distance_m = float(np.linalg.norm(place))
         nearest = min(nearest, distance_m)
         off_rad = wrap_rad(math.atan2(-place[1], -place[0]) - course_rad)
         course_rad += max(-rate_rad_s * dt_s, min(rate_rad_s * dt_s, off_rad))
-        speed = min(speed_m_s, homing_m_s((-place[0], -place[1]), course_rad, frame_period_s))
+        speed = min(speed_m_s, goal_approach_m_s((-place[0], -place[1]), course_rad, frame_period_s))
         place = place + dt_s * speed * np.array([math.cos(course_rad), math.sin(course_rad)])
     return nearest
 
@@ -70,7 +71,7 @@ def test_where_nothing_keeps_clear_the_roomiest_way_is_taken() -> None:
 
 @pytest.mark.parametrize(("frame_period_s", "share_of_tight"), [(0.1, 0.5), (0.2, 0.5), (0.8, 0.8), (2.0, 1.0)])
 def test_frames_far_apart_take_more_room(frame_period_s: float, share_of_tight: float) -> None:
-    assert slim_margin_m(0.15, frame_period_s) == pytest.approx(share_of_tight * 0.15)
+    assert path_margin_m(0.15, frame_period_s) == pytest.approx(share_of_tight * 0.15)
 
 
 @pytest.mark.parametrize("obstacles", [np.empty((0, 2)), np.array([[9.0, -5.0]])], ids=["nothing", "far away"])
@@ -85,4 +86,4 @@ def test_a_goal_aside_is_turned_onto_and_not_circled(frame_period_s: float, off_
 
 
 def test_a_goal_straight_ahead_is_not_slowed_for() -> None:
-    assert homing_m_s((5.0, 0.0), 0.0, 1.0) > 4.0
+    assert goal_approach_m_s((5.0, 0.0), 0.0, 1.0) > 4.0

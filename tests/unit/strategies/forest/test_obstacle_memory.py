@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.forest.obstacle_memory import STEP_M, ObstacleMemory
+from morpheyes_daemon.strategies.forest.obstacle_memory import RANGE_STEP_M, ObstacleMemory
 from morpheyes_daemon.strategies.obstacles.polar_profile import ObstacleProfile
 from tests.support.seen_from_above import BINS, blind, empty_profile, with_points
 
 MIDDLE = np.array([BINS // 2])
-LIMIT_M = 12.0 - STEP_M
+LIMIT_M = 12.0 - RANGE_STEP_M
 """Profiles look 12 m far."""
 
 
@@ -52,14 +52,14 @@ def test_of_what_was_never_seen_nothing_is_free() -> None:
 def test_a_blind_moment_leaves_free_what_was_seen_to_be_free_less_the_way_flown_since() -> None:
     dark = blind(empty_profile(2.0, north_m=4.0))
     memory = remembering(empty_profile(1.0), dark)
-    assert free_m(memory, dark) == pytest.approx(LIMIT_M - 4.0, abs=STEP_M)
+    assert free_m(memory, dark) == pytest.approx(LIMIT_M - 4.0, abs=RANGE_STEP_M)
 
 
 def test_a_shadow_beside_a_trunk_is_free_as_far_as_the_view_before_reached_past_it() -> None:
     before = with_points(empty_profile(1.0), [(9.0, 0.0)])
     shadow = blind(empty_profile(1.8, north_m=3.0), -0.02, 0.02)
     # well before the trunk, as depth errs
-    assert free_m(remembering(before, shadow), shadow) == pytest.approx(0.9 * 9.0 - 0.3 - 3.0, abs=STEP_M)
+    assert free_m(remembering(before, shadow), shadow) == pytest.approx(0.9 * 9.0 - 0.3 - 3.0, abs=RANGE_STEP_M)
 
 
 def test_two_views_that_each_saw_a_part_are_put_together() -> None:
@@ -67,7 +67,7 @@ def test_two_views_that_each_saw_a_part_are_put_together() -> None:
     aside = replace(empty_profile(1.5, east_m=1.0, yaw_rad=-0.2), trust_m=6.0)
     dark = blind(empty_profile(2.0))
     assert free_m(remembering(first, dark), dark) == 2.0
-    assert free_m(remembering(first, aside, dark), dark) == pytest.approx(math.sqrt(36.0 - 1.0), abs=STEP_M)
+    assert free_m(remembering(first, aside, dark), dark) == pytest.approx(math.sqrt(36.0 - 1.0), abs=RANGE_STEP_M)
 
 
 def test_space_seen_to_be_free_is_forgotten_with_the_obstacles() -> None:
@@ -99,7 +99,7 @@ def test_the_edge_of_a_view_is_not_looked_beyond() -> None:
     turned = blind(empty_profile(1.2, yaw_rad=0.3))
     memory = remembering(empty_profile(1.0), turned)
     inside, outside = np.array([10]), np.array([BINS - 10])
-    assert free_m(memory, turned, inside) == pytest.approx(LIMIT_M, abs=STEP_M)
+    assert free_m(memory, turned, inside) == pytest.approx(LIMIT_M, abs=RANGE_STEP_M)
     assert free_m(memory, turned, outside) == 2.0
 
 
