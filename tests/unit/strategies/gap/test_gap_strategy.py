@@ -12,7 +12,7 @@ from morpheyes_daemon.messages.core import DepthSummary, Intent, VehicleState
 from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft
-from morpheyes_daemon.strategies.gap.openings import Opening, Place
+from morpheyes_daemon.strategies.gap.openings import CrossingPoint, Opening
 from morpheyes_daemon.strategies.gap.parameters import GapParameters
 from morpheyes_daemon.strategies.gap.perception import GapPercept
 from morpheyes_daemon.strategies.gap.strategy import Gap, Phase
@@ -23,7 +23,7 @@ WALL_M, BEYOND_M = 7.0, 8.0
 
 
 def opening(place=(WALL_M, 0.2, -1.4), room_m=0.04, z_m=4.0, cut=False):
-    at = Place(place, room_m)
+    at = CrossingPoint(place, room_m)
     width, height = 0.337 + 2 * room_m, 0.187 + 2 * room_m
     return Opening(np.zeros((4, 2), np.float32), z_m, (at,), at, width, height, BEYOND_M, cut)
 

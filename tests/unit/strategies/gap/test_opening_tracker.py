@@ -5,7 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.gap.opening_tracker import POSITION_WALK_M_S, PointTrack, Sighting, fit_wave
+from morpheyes_daemon.strategies.gap.opening_tracker import (
+    POSITION_WALK_M_SQRT_S,
+    PointMeasurement,
+    PointTracker,
+    fit_oscillation,
+)
 
 S = 1_000_000_000
 SIGMA = np.full(3, 0.02)
@@ -16,23 +21,23 @@ def sway(t_s):
 
 
 def watched(where, seconds, noise_m=0.02, moves=False, yaw_rad=0.0):
-    track, rng = PointTrack(yaw_rad), np.random.default_rng(0)
+    track, rng = PointTracker(yaw_rad), np.random.default_rng(0)
     for k in range(round(5 * seconds)):
-        track.see(k * S // 5, where(k / 5) + rng.normal(0.0, noise_m, 3), SIGMA)
+        track.update(k * S // 5, where(k / 5) + rng.normal(0.0, noise_m, 3), SIGMA)
         if moves:
-            track.move()
+            track.set_moving()
     return track, (round(5 * seconds) - 1) / 5
 
 
 def flown_at(where, aside_rad, moves=False):
     """Watched from 4 m for ten seconds, then closed in on at 3 m/s to 1 m, by eyes that point aside and down."""
-    track, rng = PointTrack(), np.random.default_rng(3)
+    track, rng = PointTracker(), np.random.default_rng(3)
     for k in range(56):
         t_s, range_m = k / 5, min(4.0, 4.0 - 3.0 * (k / 5 - 10.0))
         off = np.array([0.0, aside_rad * range_m, -aside_rad * range_m]) + rng.normal(0.0, 0.002 * range_m, 3)
-        track.see(k * S // 5, where(t_s) + off, np.full(3, 0.003 * range_m), range_m)
+        track.update(k * S // 5, where(t_s) + off, np.full(3, 0.003 * range_m), range_m)
         if moves:
-            track.move()
+            track.set_moving()
     return track, 11.0
 
 
@@ -53,7 +58,7 @@ def test_eyes_that_point_aside_are_found_out_as_the_range_shrinks():
 
 def test_a_wave_is_led_by_two_seconds():
     track, t_s = watched(sway, 9.0, moves=True)
-    assert track.wave is not None
+    assert track.oscillation is not None
     ahead = track.at(round((t_s + 2.0) * S))
     # half a second of a 0.5 m/s wall would be 0.25 m
     assert ahead.p_m[1:] == pytest.approx(sway(t_s + 2.0)[1:], abs=0.04)
@@ -69,14 +74,14 @@ def test_a_swaying_point_is_led_by_eyes_that_point_aside():
 def test_a_sight_that_may_be_far_off_leaves_the_wave_as_it_was():
     track, t_s = watched(sway, 12.0, moves=True)
     before = track.at(round((t_s + 0.5) * S)).p_m
-    track.see(round((t_s + 0.2) * S), sway(t_s + 0.2) + (0.0, 0.6, 0.0), np.array([0.02, 0.6, 0.6]))
-    assert track.wave is not None
+    track.update(round((t_s + 0.2) * S), sway(t_s + 0.2) + (0.0, 0.6, 0.0), np.array([0.02, 0.6, 0.6]))
+    assert track.oscillation is not None
     assert track.at(round((t_s + 0.5) * S)).p_m[1:] == pytest.approx(before[1:], abs=0.005)
 
 
 def test_a_moving_point_without_a_wave_is_led_by_its_speed():
     track, t_s = watched(lambda t: np.array([4.0, 0.4 * t, -1.5]), 2.4, noise_m=0.005, moves=True)
-    assert track.wave is None
+    assert track.oscillation is None
     assert track.at(round((t_s + 0.5) * S)).p_m[1] == pytest.approx(0.4 * (t_s + 0.5), abs=0.06)
 
 
@@ -96,9 +101,14 @@ def test_a_wall_never_moves_along():
 
 def test_jumping_about_is_no_wave():
     rng = np.random.default_rng(1)
-    jumps = [Sighting(k * S // 5, rng.normal(0.0, 0.4, 3), SIGMA, 4.0) for k in range(40)]
-    assert fit_wave(jumps, POSITION_WALK_M_S) is None
-    assert fit_wave([Sighting(k * S // 5, sway(k / 5), SIGMA, 4.0) for k in range(5)], POSITION_WALK_M_S) is None
+    jumps = [PointMeasurement(k * S // 5, rng.normal(0.0, 0.4, 3), SIGMA, 4.0) for k in range(40)]
+    assert fit_oscillation(jumps, POSITION_WALK_M_SQRT_S) is None
+    assert (
+        fit_oscillation(
+            [PointMeasurement(k * S // 5, sway(k / 5), SIGMA, 4.0) for k in range(5)], POSITION_WALK_M_SQRT_S
+        )
+        is None
+    )
 
 
 def test_four_periods_tell_the_period_better_than_two():
@@ -108,10 +118,10 @@ def test_four_periods_tell_the_period_better_than_two():
         for _ in range(12):
             drift = np.cumsum(rng.normal(0.0, 0.02 * math.sqrt(0.2), 5 * seconds))
             seen = [
-                Sighting(k * S // 5, sway(k / 5) + np.array([0.0, drift[k], 0.0]), SIGMA, 4.0)
+                PointMeasurement(k * S // 5, sway(k / 5) + np.array([0.0, drift[k], 0.0]), SIGMA, 4.0)
                 for k in range(5 * seconds)
             ]
-            wave = fit_wave(seen, POSITION_WALK_M_S)
+            wave = fit_oscillation(seen, POSITION_WALK_M_SQRT_S)
             assert wave is not None
             errors[seconds].append(wave.rate_rad_s - 1.0)
     # the error of a frequency goes with the record's length to the power of -1.5: by 4 here, of few trials by 2
