@@ -29,7 +29,7 @@ MIN_SPACING_NS = S // 10
 Chosen: at the vehicle's speeds nearer ones see the same; hundreds of them would delay the event loop."""
 
 RANGE_SHARE, RANGE_MARGIN_M = 0.9, 0.3
-"""Space is seen through up to this share of the range of what stands there, less the margin in metres.
+"""Space is seen through up to this share of the range of what stands there, less the margin. Unit: none, m.
 
 Chosen: depth error within trusted range; closer to the obstacle, mismatches would erase it."""
 

@@ -202,7 +202,7 @@ class PointTracker:
 
     @property
     def centre(self) -> Array:
-        """Mean position (3,) along, across and down: the oscillation's centre, or the mean of the measurements."""
+        """Mean position (3,), metres along, across and down: the oscillation's centre, or the measurements' mean."""
         if self._oscillation is not None:
             return self._oscillation.centre
         return np.mean([measurement.p_m for measurement in self._measured], axis=0) if self._measured else np.zeros(3)

@@ -29,7 +29,9 @@ RANSAC_SAMPLES = 64
 Source: equation, (1 - 0.5^3)^64 = 2e-4: with half of the image on the wall all miss it once in 5000 images."""
 
 RANSAC_SEED = 15
-"""Seed of the random triples, fixed so that the result is deterministic. Unit: none. Chosen: any value does."""
+"""Seed of the random triples, fixed so that the result is deterministic. Unit: none.
+
+Chosen: any value does; another one changes which triples are tried, not the result beyond noise."""
 
 VOTE_STRIDE = 3
 """Every n-th known point votes on the planes; the least squares afterwards take all. Unit: points.
@@ -226,7 +228,7 @@ def _wall_plane(inverse: InverseDepth, width: int, sigma_1_m: float) -> tuple[Pl
 
 
 def median(values: NDArray[np.floating]) -> float:
-    """Return the median, in their unit, of known values (n,), n > 0; np.median without its checks."""
+    """Return the median of known values (n,), n > 0, unitless or in their own unit; np.median without its checks."""
     half = values.size // 2
     if values.size % 2:
         return float(np.partition(values, half)[half])

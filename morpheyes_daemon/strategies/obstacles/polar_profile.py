@@ -73,7 +73,7 @@ SHADOWED_SHARE = 0.5
 Chosen: a majority; lower gives the range of an occluder to bins that only border on its shadow."""
 
 SUPPORT_SHARE, MIN_SUPPORT_PX = 0.2, 2.0
-"""Share of a surface that fills bin and band, and pixels at least, that make a cell an obstacle.
+"""Share of a surface that fills bin and band, and pixels at least, that make a cell an obstacle. Unit: none, px.
 
 Chosen: lower stops for mismatches, higher overlooks branches that fill a fifth of the band."""
 

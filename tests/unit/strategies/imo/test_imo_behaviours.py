@@ -13,9 +13,9 @@ from morpheyes_daemon.strategies.imo.behaviours import (
     Dodge,
     ObjectState,
     Pursue,
-    encounter,
+    closest_approach,
+    evasion_direction,
     pursuit_velocity,
-    way_out,
 )
 from morpheyes_daemon.strategies.imo.strategy import Imo, ImoParameters, ImoPercept
 from tests.support.seen_from_above import CRAFT, SUMMARY, empty_profile
@@ -37,11 +37,11 @@ def test_pursuit_keeps_the_distance_and_goes_along_with_the_object() -> None:
 
 
 def test_an_encounter_is_the_nearest_passage() -> None:
-    passing = encounter(thing((4.0, 0.3, 0), (-1.0, 0.0, 0)), np.zeros(3), 10.0)
+    passing = closest_approach(thing((4.0, 0.3, 0), (-1.0, 0.0, 0)), np.zeros(3), 10.0)
     assert passing is not None
     assert passing.in_s == pytest.approx(4.0)
     assert passing.distance_m == pytest.approx(0.3)
-    assert encounter(thing((4.0, 0.0, 0), (1.0, 0, 0)), np.zeros(3), 10.0) is None
+    assert closest_approach(thing((4.0, 0.0, 0), (1.0, 0, 0)), np.zeros(3), 10.0) is None
 
 
 def test_the_spread_of_a_predicted_path_grows_with_time() -> None:
@@ -52,9 +52,9 @@ def test_the_spread_of_a_predicted_path_grows_with_time() -> None:
 
 def test_the_way_out_is_across_the_path_and_away_from_it() -> None:
     coming = thing((4.0, 0.2, 0), (-1.0, 0.0, 0))
-    passing = encounter(coming, np.zeros(3), 10.0)
+    passing = closest_approach(coming, np.zeros(3), 10.0)
     assert passing is not None
-    out = way_out(passing, coming)
+    out = evasion_direction(passing, coming)
     assert np.allclose(out, (0.0, -1.0))  # it passes east of us, so west
 
 
