@@ -36,7 +36,7 @@ Chosen: more than the backlash (twice 0.25 mm by default), less than a motion th
 UNCERTAIN_M = 0.001
 """Sigma beyond backlash and repeatability, at rest, from which the same target is commanded again.
 
-Chosen: five times the sigma of a settled servo; lower repeats commands that change nothing."""
+Chosen: ten times the servo's repeatability; lower repeats commands that change nothing."""
 
 REVERSAL_SIGMA_M = 0.003
 """Sigma above which a shrinking motion is not reversed; one reversal adds about as much.

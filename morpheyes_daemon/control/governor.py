@@ -91,19 +91,19 @@ class Governor:
         flown_m = math.hypot(
             vehicle.p_ned_m[0] - command.p_measured_ned_m[0], vehicle.p_ned_m[1] - command.p_measured_ned_m[1]
         )
-        seen = {"clear": command.clear_m - flown_m, "trust": trust_m - flown_m}
+        free_m = {"clear": command.clear_m - flown_m, "trust": trust_m - flown_m}
         bounds = {
             name: stopping.speed_for_distance_m(max(0.0, distance - limits.standoff_m), height_m, limits.dead_daemon_s)
-            for name, distance in seen.items()
+            for name, distance in free_m.items()
         }
         bounds["sync"] = self._sync_bound(summary, command)
         bounds["cap"] = limits.max_speed_m_s
         bounds = {name: value if math.isfinite(value) else 0.0 for name, value in bounds.items()}
         name = min(bounds, key=lambda key: bounds[key])
         speed = math.hypot(vehicle.v_ned_m_s[0], vehicle.v_ned_m_s[1])
-        available_m = max(0.0, min(seen.values()) - limits.standoff_m)
+        available_m = max(0.0, min(free_m.values()) - limits.standoff_m)
         stick = self._stick_limit(speed, available_m, bounds[name], stopping, height_m)
-        return Governed(now_ns, bounds[name], name, seen["clear"], trust_m, speed, wanted, stick)
+        return Governed(now_ns, bounds[name], name, free_m["clear"], trust_m, speed, wanted, stick)
 
     def _stick_limit(
         self, speed_m_s: float, available_m: float, limit_m_s: float, stopping: Stopping, height_m: float

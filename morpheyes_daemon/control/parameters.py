@@ -1,7 +1,7 @@
 """The autopilot's parameters in SI units, whatever their name and unit in the firmware at hand.
 
 ArduPilot renames parameters and changes their units between releases (4.6: LOIT_SPEED in cm/s, 4.8: LOIT_SPEED_MS
-in m/s). This table is the only place that knows; it asks no autopilot.
+in m/s). Only this table holds names and units; it does not talk to an autopilot.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """PID control with explicit time steps and conditional anti-windup.
 
-It keeps no clock and knows no units: error, output and gains are the caller's. The output is not slewed here.
+No clock and no units: error, output and gains are the caller's. The output is not slewed here.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ Chosen: a fifteenth of the lean's time constant; smaller makes the table slower 
 _LONGEST_STOP_S = 30.0
 """Longest simulated stop.
 
-Chosen: five times the longest stop of plausible parameters; bounds the computation."""
+Chosen: several times a vehicle's longest stop; bounds the computation for implausible parameters."""
 
 _SHORTEST_STOP_S = 0.5
 """Time before which the simulation does not end.

@@ -53,7 +53,7 @@ Chosen: the stick period, since there is no last call to measure from."""
 MAX_STATE_AGE_S = 0.2
 """Longest age of the measured velocity that is predicted over.
 
-Chosen: the longest latency of a link that still counts as fresh; a longer prediction amplifies noise."""
+Chosen: the longest latency that the loop is tuned for; a longer prediction amplifies noise."""
 
 
 @dataclass(frozen=True, slots=True)

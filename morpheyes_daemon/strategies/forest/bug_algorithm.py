@@ -20,7 +20,7 @@ Chosen: shorter begins at every detour around a tree, longer waits in a pocket."
 PATIENCE_S = 30.0
 """Boundary following without progress ends after this time, the next one after twice as long.
 
-Chosen: long enough to leave a pocket of 20 m; longer follows a boundary that leads nowhere."""
+Chosen: long enough to leave a pocket among trees; longer follows a boundary that leads nowhere."""
 
 PROGRESS_M = 1.0
 """Decrease of the distance to the goal that counts as progress.
@@ -30,7 +30,7 @@ Chosen: more than the drift of the position estimate, less than a tree's diamete
 FREE_ENOUGH_M = 3.0
 """A heading that is free for this distance may be followed.
 
-Chosen: more than a stop from walking speed; longer leaves the boundary in narrow places."""
+Chosen: room to fly on; a longer distance leaves the boundary in narrow places."""
 
 FREE_SHARE = 0.6
 """Share of the longest free distance that is enough in narrow places. Unit: none.

@@ -63,7 +63,7 @@ Chosen: independent of the speed, or a slow vehicle would accept a heading into 
 UNSEEN_M = 2.0
 """An obstacle is assumed at this range in directions about which nothing is known.
 
-Chosen: nearer makes every hole in the depth a stop, farther flies into unseen space faster than it is seen."""
+Chosen: nearer makes every hole in the depth a stop, farther flies into unknown space too fast to stop."""
 
 MIN_UNKNOWN_BINS = 3
 """Run of adjacent bins without depth that counts as unknown. Unit: bins.

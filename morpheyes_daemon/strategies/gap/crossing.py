@@ -44,7 +44,7 @@ opening's speed is accounted for and its acceleration is small."""
 ACCELERATION_COST_S = 0.75
 """Extra time of a run that starts at rest, compared with the set speed all the way.
 
-Chosen: as flown on the simulated Loiter; a wrong value shifts the arrival by its error."""
+Chosen: for about the lean that Loiter gives; a wrong value shifts the arrival by its error."""
 
 
 @dataclass(slots=True)

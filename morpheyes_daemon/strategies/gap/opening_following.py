@@ -37,7 +37,7 @@ Chosen: closer, the contour is blurred by more than a pixel."""
 ATTITUDE_LATENCY_S = 0.03
 """Error of an attitude's stamp, which counts while the vehicle pitches; before a wall it hardly yaws.
 
-Chosen: one period of ATTITUDE messages; larger discards measurements during every correction."""
+Chosen: of the order of a message's period; larger discards measurements during every correction."""
 
 YAW_SIGMA: Array = np.full(3, 0.02)
 """One sigma (3,) of a wall's measured heading. Unit: rad.

@@ -40,8 +40,8 @@ Chosen: those of the worlds with moving gaps; smaller lags, larger follows noise
 HISTORY_S = 26.0
 """Measurements are kept for this time.
 
-Chosen: the error of the period falls with the history to the power of 1.5, and four periods are in it; longer would
-average over changes of the motion."""
+Chosen: the error of the period falls with the history to the power of 1.5, so several periods must be in it; longer
+would average over changes of the motion."""
 
 MIN_OSCILLATION_S, MIN_MEASUREMENTS = 3.0, 10
 """Time and number of measurements from which a sinusoid is fitted. Unit: s, measurements.
@@ -61,7 +61,7 @@ Chosen: less than a period still shows its turning points; longer periods fit a 
 REFINEMENTS, REFINED_PERIODS = 3, 9
 """Rounds of the search for the period, and periods tried in each but the first. Unit: counts.
 
-Chosen: resolves the period to a thousandth."""
+Chosen: resolves the period to a quarter of a percent."""
 
 POINTING_CORRELATION_S = 1.0
 """Correlation time of the attitude's error.

@@ -48,7 +48,7 @@ Chosen: does not change the run; smaller waits for the position to settle."""
 YAW_TOLERANCE_RAD = math.radians(3.0)
 """Yaw error up to which the run may begin.
 
-Chosen: 0.05 of the bar's length as depth, 1 % of its width; smaller waits for the yaw's drift."""
+Chosen: it adds 5 % of the hull's length to the vehicle's width; smaller waits for the yaw's drift."""
 
 MOVING_TOLERANCE = 2.5
 """Factor on both tolerances before a moving opening. Unit: none.
