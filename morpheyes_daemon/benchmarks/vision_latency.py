@@ -147,7 +147,7 @@ def bench_latency(plan: FlightPlan, repeats: int, report: Report) -> LatencyBenc
 async def _through_worker(
     plan: FlightPlan, frames: list[StereoFrame], report: Report
 ) -> tuple[list[float], list[float]]:
-    factory = PipelineFactory(plan.config, plan.mission, plan.calibration)
+    factory = PipelineFactory(plan.config, plan.mission, read_calibration(plan.calibration))
     worker: ProcessWorker[VisionJob, Perception] = ProcessWorker(factory, job_timeout_s=JOB_TIMEOUT_S)
     latency, compute = [], []
     await worker.start()

@@ -24,17 +24,18 @@ def command(
     import asyncio
 
     from morpheyes_daemon.config.packaged import load_config
-    from morpheyes_daemon.daemon.service import calibration_file, real_time_runner, serve
+    from morpheyes_daemon.daemon.service import load_rig, real_time_runner, serve
+    from morpheyes_daemon.daemon.stdio import given_away
+    from morpheyes_daemon.perception.pipeline import PipelineFactory
     from morpheyes_daemon.strategies.missions import find_mission, load_mission
 
     vehicle = load_config(config)
     if calibration is not None:
         vehicle = vehicle.model_copy(update={"calibration": calibration})
     name = mission or vehicle.mission
-    file = load_mission(name)
-    calibration_file(vehicle)
-    with real_time_runner() as runner:
+    pipeline = PipelineFactory(vehicle, load_mission(name), load_rig(vehicle))
+    with real_time_runner() as runner, given_away() as journal:
         try:
-            runner.run(serve(vehicle, find_mission(name).stem, file, lambda line: typer.echo(line, err=True)))
+            runner.run(serve(pipeline, find_mission(name).stem, journal))
         except asyncio.CancelledError:
             raise typer.Exit(130) from None

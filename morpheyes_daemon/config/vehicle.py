@@ -5,10 +5,11 @@ Screen units (`_mm`, `_deg`) are allowed here and converted by the properties; e
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
 
 class Section(BaseModel):
@@ -72,7 +73,49 @@ class V4l2CameraConfig(CameraBase):
     swap_eyes: bool = Field(False, description="the right eye is in the left half")
 
 
-CameraConfig = Annotated[SimCameraConfig | RecordingCameraConfig | V4l2CameraConfig, Field(discriminator="backend")]
+class PluginConfig(Section):
+    """A backend of another package, found through its entry point; it checks the `options` itself."""
+
+    group: ClassVar[str]
+    built_in: ClassVar[tuple[str, ...]]
+
+    backend: str = Field(min_length=1, max_length=100)
+    options: Any = Field(default_factory=dict, description="the backend's own settings")
+
+    @field_validator("backend")
+    @classmethod
+    def _installed(cls, backend: str) -> str:
+        installed = {point.name for point in entry_points(group=cls.group)}
+        if backend not in installed:
+            names = ", ".join(sorted({*cls.built_in, *installed}))
+            raise ValueError(f"there is no backend {backend!r}; installed are: {names}")
+        return backend
+
+
+class PluginCameraConfig(CameraBase, PluginConfig):
+    """A camera of another package (entry point group `morpheyes.cameras`)."""
+
+    group = "morpheyes.cameras"
+    built_in = ("recording", "sim", "v4l2")
+
+
+def _backend_of(*built_in: str) -> Discriminator:
+    """Choose among the named backends; any other name is a plugin's."""
+
+    def tag(value: Any) -> str:
+        backend = value.get("backend") if isinstance(value, dict) else getattr(value, "backend", None)
+        return backend if backend in built_in else "plugin"
+
+    return Discriminator(tag)
+
+
+CameraConfig = Annotated[
+    Annotated[SimCameraConfig, Tag("sim")]
+    | Annotated[RecordingCameraConfig, Tag("recording")]
+    | Annotated[V4l2CameraConfig, Tag("v4l2")]
+    | Annotated[PluginCameraConfig, Tag("plugin")],
+    _backend_of(*PluginCameraConfig.built_in),
+]
 
 
 class ServoMotion(Section):
@@ -109,13 +152,27 @@ class NoServoConfig(Section):
     baseline_mm: float = Field(200.0, ge=10, le=1000)
 
 
-ServoConfig = Annotated[SerialServoConfig | NoServoConfig, Field(discriminator="backend")]
+class PluginServoConfig(PluginConfig):
+    """A servo of another package (entry point group `morpheyes.servos`)."""
+
+    group = "morpheyes.servos"
+    built_in = ("none", "serial")
+
+    motion: ServoMotion = ServoMotion()
+
+
+ServoConfig = Annotated[
+    Annotated[SerialServoConfig, Tag("serial")]
+    | Annotated[NoServoConfig, Tag("none")]
+    | Annotated[PluginServoConfig, Tag("plugin")],
+    _backend_of(*PluginServoConfig.built_in),
+]
 
 
 class AutopilotConfig(Section):
     """The MAVLink link to ArduCopter."""
 
-    backend: Literal["mavlink"] = "mavlink"
+    backend: str = Field("mavlink", min_length=1, description="mavlink, or another package's (morpheyes.autopilots)")
     url: str = Field("serial:/dev/ttyAMA0:921600", min_length=1, description="serial:, tcp:, udp: or udpin:")
     vehicle_sysid: int = Field(1, ge=1, le=254)
     override_sysid: int = Field(255, ge=1, le=255, description="must equal MAV_GCS_SYSID (SYSID_MYGCS before 4.7)")

@@ -58,7 +58,7 @@ def validate(data: Any, model: type[M], name: str, root: yaml.Node | None) -> M:
 
 def _sentence(problem: dict[str, Any], name: str, root: yaml.Node | None) -> str:
     location = [str(part) for part in problem["loc"]]
-    keys, line = _find(location, root)
+    keys, line = _find(location, root) if root is not None else (location, None)
     where = f"{name}:{line}" if line else name
     key = ".".join(keys) or "the file"
     if problem["type"] == "extra_forbidden":

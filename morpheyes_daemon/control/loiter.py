@@ -4,7 +4,7 @@ Loiter turns a stick into a lean angle with drag, so a held stick settles at a s
 dead zone, v = v_lim tan(n theta) / tan(theta), with time constant v_lim / (g tan(theta)). Everything here is read
 from the autopilot (RCMAP_*, RCn_*, LOIT_*, PILOT_*). No loop is closed here.
 
-Sticks are always in the order roll, pitch, throttle, yaw; `channels` puts them in the radio's order.
+Sticks are always in the order roll, pitch, throttle, yaw; the autopilot link's stick output has the channel map.
 """
 
 from __future__ import annotations
@@ -185,12 +185,6 @@ class LoiterModel:
     def maximum(self) -> Widths:
         """Largest pulse width of each stick."""
         return self.roll.max_us, self.pitch.max_us, self.throttle.axis.max_us, self.yaw.max_us
-
-    def channels(self, sticks: Widths) -> Widths:
-        """Put roll, pitch, throttle, yaw in the order of channels 1 to 4 (RCMAP_*)."""
-        axes = (self.roll, self.pitch, self.throttle.axis, self.yaw)
-        by_number = {axis.number: width for axis, width in zip(axes, sticks, strict=True)}
-        return by_number[1], by_number[2], by_number[3], by_number[4]
 
     def limit_m_s(self, height_m: float) -> float:
         """Return v_lim: LOIT_SPEED, or the lower limit of the flow sensor at this height above ground.

@@ -1,11 +1,14 @@
 """Stick controller, one stick period: the mission's command through governor and velocity loop to stick positions.
 
-Pure composition of `path_following`, `governor`, `velocity` and `loiter`; the gate still decides what is sent.
+Pure composition of `path_following`, `governor`, `velocity` and `loiter`; the gate still decides what is sent. It
+exists from the start and is configured when the autopilot's parameters have been read; before that it returns no
+sticks.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 from morpheyes_daemon.control.governor import Governor
@@ -26,7 +29,44 @@ Chosen: four times the noise of the measured velocity; higher ignores a real dri
 
 
 class StickController:
-    """Owns the velocity loop; a new one is made when the autopilot's parameters change."""
+    """The flight control of one vehicle; its loops are made anew when the Loiter model changes.
+
+    `tuning_for` returns the velocity loop's bounds for a Loiter model.
+    """
+
+    def __init__(self, governor: Governor, tuning_for: Callable[[LoiterModel], VelocityTuning]) -> None:
+        self._governor = governor
+        self._tuning_for = tuning_for
+        self._loop: _Loop | None = None
+
+    @property
+    def model(self) -> LoiterModel | None:
+        """The Loiter model, None before the autopilot's parameters are known."""
+        return self._loop.model if self._loop else None
+
+    def configure(self, model: LoiterModel) -> None:
+        """Set the vehicle's Loiter model; an equal one keeps the state of the loops."""
+        if self.model != model:
+            self._loop = _Loop(model, self._governor, self._tuning_for(model))
+
+    def reset(self) -> None:
+        """Clear the integrals of the loops; call while the daemon does not hold the sticks."""
+        if self._loop is not None:
+            self._loop.reset()
+
+    def step(
+        self, command: MissionCommand, summary: DepthSummary, vehicle: VehicleState, now_ns: int
+    ) -> tuple[Sticks, Governed] | None:
+        """Return the sticks for a command, and the bound that the governor put on its speed; None before `configure`."""
+        return self._loop.step(command, summary, vehicle, now_ns) if self._loop else None
+
+    def stopping_distance_m(self, speed_m_s: float, height_m: float, reaction_s: float = 0.0) -> float:
+        """Return the distance to standstill after `reaction_s` at the same speed; inf before `configure`."""
+        return self._loop.model.stopping_distance_m(speed_m_s, height_m, reaction_s) if self._loop else math.inf
+
+
+class _Loop:
+    """Path following, governor and velocity loop on one Loiter model."""
 
     def __init__(self, model: LoiterModel, governor: Governor, tuning: VelocityTuning) -> None:
         self.model = model
@@ -35,14 +75,13 @@ class StickController:
         self._path = PathFollower()
 
     def reset(self) -> None:
-        """Clear the integrals of both loops; call while the daemon does not hold the sticks."""
+        """Clear the integrals of both loops."""
         self._velocity.reset()
         self._path.reset()
 
     def step(
         self, command: MissionCommand, summary: DepthSummary, vehicle: VehicleState, now_ns: int
     ) -> tuple[Sticks, Governed]:
-        """Return the sticks for a command, and the bound that the governor put on its speed."""
         fast_response = command.line is not None and command.line.fast_response
         filtered = self._velocity.filtered_state(vehicle, now_ns)
         state = filtered if fast_response else vehicle

@@ -1,6 +1,6 @@
 """The daemon on real devices, as systemd or a person starts it: parts, flight log, page, mavsdk, systemd and signals.
 
-What is not connected is waited for in PREFLIGHT. Everything that decides about flight is in app.py and below it.
+What is not connected is waited for in PREFLIGHT. Everything that decides about flight is in composition.py and below it.
 """
 
 from __future__ import annotations
@@ -9,32 +9,33 @@ import asyncio
 import gc
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from pathlib import Path
+from contextlib import contextmanager
+from typing import Any
 
 from morpheyes_daemon import __version__
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, running_clock, wall_time_s
-from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
+from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.daemon.composition import Daemon, Parts
 from morpheyes_daemon.daemon.sd_notify import notify
 from morpheyes_daemon.daemon.systemd import SystemdReport
-from morpheyes_daemon.dashboard.server import Dashboard
 from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
 from morpheyes_daemon.devices.camera import build_camera
-from morpheyes_daemon.devices.link import open_link
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.servo import build_servo
-from morpheyes_daemon.doctor.findings import Severity
-from morpheyes_daemon.doctor.rig import examine_calibration
-from morpheyes_daemon.errors import CalibrationError
+from morpheyes_daemon.doctor.rig import examine_rig
+from morpheyes_daemon.errors import CalibrationError, mistake
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Health
+from morpheyes_daemon.observer.feed import Feed
+from morpheyes_daemon.observer.process import InheritedFile, ObserverJob
+from morpheyes_daemon.observer.task import ObserverTask
 from morpheyes_daemon.perception.craft import fitting_rig
 from morpheyes_daemon.perception.pipeline import PipelineFactory
 from morpheyes_daemon.recorder.flight_log import flight_header, flight_path
-from morpheyes_daemon.recorder.recorder import Recorder
-from morpheyes_daemon.stereo.calibration_file import calibration_hash, read_calibration
+from morpheyes_daemon.stereo.calibration_file import calibration_hash
+from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.supervisor.supervisor import Pulse, Task
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 
@@ -42,33 +43,31 @@ JOB_TIMEOUT_S = 2.0
 """A frame that takes longer than this is lost, and the worker with it."""
 DASHBOARD_IMAGE_HZ = 2.0
 
-Say = Callable[[str], None]
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""SIGHUP comes when the terminal or the ssh session that started us goes away."""
 
 
-def calibration_file(config: VehicleConfig) -> Path:
-    """Return the configured calibration; raises CalibrationError when it does not fit the rig."""
+def load_rig(config: VehicleConfig) -> RigModel:
+    """Read the configured calibration; raises CalibrationError when there is none or it does not fit the vehicle."""
     if config.calibration is None:
         raise CalibrationError(
             "calibration is not set: make a file with `morpheyes calibrate solve` and name it in config.yaml, "
             "or give --calibration FILE."
         )
-    fitting_rig(config.calibration, config)
-    return config.calibration
+    return fitting_rig(config.calibration, config)
 
 
 def build_parts(
-    config: VehicleConfig,
-    mission: MissionFile,
-    clock: Clock,
-    events: EventLog,
+    pipeline: PipelineFactory,
+    context: DeviceContext,
     tell: Callable[[Health], None] = lambda report: None,
     film: bool = False,
 ) -> Parts:
     """Return the real devices and the vision worker, nothing open yet; `film` keeps a picture of every frame.
 
-    Raises ConfigError or CalibrationError.
+    Raises ConfigError.
     """
-    pipeline = PipelineFactory(config, mission, calibration_file(config))
+    config, clock, events = pipeline.config, context.clock, context.events
 
     def on_worker_death(text: str) -> None:
         events.publish(Event(clock.now_ns(), "vision", Reason.WORKER_LOST, text))
@@ -78,30 +77,40 @@ def build_parts(
     page_hz = DASHBOARD_IMAGE_HZ if config.dashboard.enabled else 0.0
     return Parts(
         clock=clock,
-        camera=build_camera(config.camera, clock),
-        servo=build_servo(config.servo, open_link, clock, events),
-        opener=open_link,
+        camera=build_camera(config.camera, context),
+        servo=build_servo(config.servo, context),
+        opener=context.opener,
         worker=ProcessWorker(pipeline, job_timeout_s=JOB_TIMEOUT_S, on_idle_death=on_worker_death),
         image_rate_hz=max(log_hz, page_hz),
         tell=tell,
     )
 
 
-async def serve(config: VehicleConfig, mission_name: str, mission: MissionFile, say: Say) -> None:
-    """Run until SIGINT or SIGTERM; `say` gets one line for every change."""
+async def serve(pipeline: PipelineFactory, mission_name: str, journal: int | None) -> None:
+    """Run until SIGINT, SIGTERM or SIGHUP; events go as lines to the file descriptor `journal`, None: nowhere."""
+    config = pipeline.config
     clock, topics, events = running_clock(), Topics.create(), EventLog()
-    began_ns = clock.now_ns()
-    events.subscribe(lambda event: say(event_line(event, began_ns)))
+    observer_job = _observer_job(pipeline, mission_name, journal, clock.now_ns())
+    feed = Feed(topics, events, clock)
     systemd = SystemdReport()
-    daemon = Daemon(config, mission, build_parts(config, mission, clock, events, systemd.tell), topics, events)
-    for task in _companions(daemon, mission_name, clock):
-        daemon.supervisor.add(task)
+    parts = build_parts(pipeline, DeviceContext(clock, events, topics), systemd.tell)
+    daemon = Daemon(config, pipeline.mission, parts, topics, events)
+    observer = ObserverTask(observer_job, feed, clock, lambda request: daemon.monitor.stop_requested(clock.now_ns()))
+    daemon.supervisor.add(Task("observer", observer.run, Reason.TASK_DIED, essential=False))
+    if config.autopilot.mavsdk:
+        daemon.supervisor.add(_mavsdk(daemon, clock))
+    asyncio.get_running_loop().set_exception_handler(lambda loop, context: _note(events, clock, context))
     stop = asyncio.Event()
-    with ending_by_signal(stop), closing(_recorder(daemon, mission_name, mission, clock)) as recorder:
-        say(f"mission {mission_name}, calibration {config.calibration}, log {recorder.path}")
-        check_calibration(daemon, clock)
-        await daemon.run(stop)
-        notify("STOPPING=1")
+    await observer.start()
+    with ending_by_signal(stop):
+        text = f"mission {mission_name}, calibration {config.calibration}, log {observer_job.log}"
+        events.publish(Event(clock.now_ns(), "daemon", Reason.STARTED, text))
+        daemon.stop_findings.take("calibration", examine_rig(pipeline.rig, config))
+        try:
+            await daemon.run(stop)
+        finally:
+            notify("STOPPING=1")
+            await observer.close()
 
 
 def real_time_runner() -> asyncio.Runner:
@@ -115,79 +124,57 @@ def real_time_runner() -> asyncio.Runner:
     return asyncio.Runner()
 
 
-def event_line(event: Event, began_ns: int) -> str:
-    """Return an event as a line for a person; what repeats the reason is left out."""
-    seconds = (event.t_ns - began_ns) / 1e9
-    text = event.text if event.reason.text in event.text else f"{event.reason.text}; {event.text}".rstrip("; ")
-    return f"{seconds:9.2f} s  {event.source:<10} {text}"
-
-
 @contextmanager
 def ending_by_signal(stop: asyncio.Event) -> Iterator[None]:
-    """The first SIGINT or SIGTERM asks for neutral, then release; a second one for release at once."""
+    """The first of `ENDING` asks for neutral, then release; a second one for release at once."""
     loop, main = asyncio.get_running_loop(), asyncio.current_task()
     assert main is not None
 
     def end() -> None:
-        if stop.is_set():
+        if stop.is_set() and main.cancelling() == 0:
             main.cancel()
         stop.set()
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ENDING:
         loop.add_signal_handler(number, end)
     try:
         yield
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ENDING:
             loop.remove_signal_handler(number)
 
 
-def check_calibration(daemon: Daemon, clock: Clock) -> None:
-    """What the doctor says against the calibration keeps the daemon from engaging."""
-    findings, _ = examine_calibration(daemon.config)
-    for finding in findings:
-        if finding.severity is Severity.STOP:
-            daemon.monitor.set_missing(Reason.DOCTOR_SAYS_NO, "calibration")
-            text = f"{finding.id}: {finding.evidence}; {finding.remedy}"
-            daemon.events.publish(Event(clock.now_ns(), "doctor", Reason.DOCTOR_SAYS_NO, text))
-
-
-def _recorder(daemon: Daemon, mission_name: str, mission: MissionFile, clock: Clock) -> Recorder:
-    config = daemon.config
-    header = flight_header(
-        mission=mission_name,
-        mission_file=mission,
-        config=config,
-        calibration_hash=calibration_hash(read_calibration(calibration_file(config))),
-        wall_s=wall_time_s(),
-    )
-    return Recorder(
-        daemon.topics,
-        daemon.events,
-        clock,
-        flight_path(config.recorder.folder, mission_name, wall_time_s()),
-        header,
+def _observer_job(pipeline: PipelineFactory, mission_name: str, journal: int | None, began_ns: int) -> ObserverJob:
+    config = pipeline.config
+    return ObserverJob(
+        log=flight_path(config.recorder.folder, mission_name, wall_time_s()),
+        header=flight_header(
+            mission=mission_name,
+            mission_file=pipeline.mission,
+            config=config,
+            calibration_hash=calibration_hash(pipeline.rig),
+            wall_s=wall_time_s(),
+        ),
         image_rate_hz=config.recorder.image_rate_hz if config.recorder.images else None,
-        threaded=True,
+        page=config.dashboard if config.dashboard.enabled else None,
+        identity={"mission": mission_name, "version": __version__, "calibration": str(config.calibration)},
+        journal=InheritedFile(journal) if journal is not None else None,
+        began_ns=began_ns,
     )
 
 
-def _companions(daemon: Daemon, mission_name: str, clock: Clock) -> list[Task]:
-    """Tasks without which it flies as well: the page and mavsdk."""
-    config, tasks = daemon.config, []
-    if config.dashboard.enabled:
-        identity = {"mission": mission_name, "version": __version__, "calibration": str(config.calibration)}
-        page = Dashboard(daemon.topics, daemon.events, clock, identity)
+def _mavsdk(daemon: Daemon, clock: Clock) -> Task:
+    """mavsdk beside the connection; the daemon flies without it as well."""
+    bridge = MavsdkBridge(daemon.connection, daemon.config.autopilot, clock)
 
-        async def show(pulse: Pulse) -> None:
-            await page.run(config.dashboard)
+    async def listen(pulse: Pulse) -> None:
+        await bridge.run()
 
-        tasks.append(Task("dashboard", show, Reason.TASK_DIED, essential=False))
-    if config.autopilot.mavsdk:
-        bridge = MavsdkBridge(daemon.connection, config.autopilot, clock)
+    return Task("mavsdk", listen, Reason.TASK_DIED, essential=False)
 
-        async def listen(pulse: Pulse) -> None:
-            await bridge.run()
 
-        tasks.append(Task("mavsdk", listen, Reason.TASK_DIED, essential=False))
-    return tasks
+def _note(events: EventLog, clock: Clock, context: dict[str, Any]) -> None:
+    """What asyncio would print about an error that nobody waits for."""
+    error = context.get("exception")
+    text = mistake(error) if isinstance(error, Exception) else str(context.get("message", ""))
+    events.publish(Event(clock.now_ns(), "daemon", Reason.TASK_DIED, text))

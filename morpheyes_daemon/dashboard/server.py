@@ -1,15 +1,15 @@
 """The page to watch: state, images, strips and health in a browser, over one WebSocket.
 
-It reads topics, asks, and never commands: every route is a GET, what a client sends is thrown away. A client that
-cannot keep up gets fewer snapshots, one that stops reading is dropped; nothing waits for either.
+It reads topics and never commands; the one thing that may be asked is a stop. A client that cannot keep up gets fewer
+snapshots, one that stops reading is dropped; nothing waits for either.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-from collections import deque
-from collections.abc import Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from aiohttp import WSCloseCode, web
 from morpheyes_daemon.bus import EventLog, Latest, Topics
 from morpheyes_daemon.clock import Clock, S, Ticker
 from morpheyes_daemon.config.vehicle import DashboardConfig
+from morpheyes_daemon.dashboard.connections import IDLE_S, limited
 from morpheyes_daemon.dashboard.snapshot import STRIPS, event_row, snapshot, strip_row
 from morpheyes_daemon.errors import DeviceNotFoundError
 from morpheyes_daemon.messages.core import Event, Image, Perception
@@ -33,6 +34,8 @@ EVENTS_KEPT = 200
 CLIENTS = 8
 SEND_TIMEOUT_S = 3.0
 LARGEST_MESSAGE = 4096
+MOST_MESSAGES = 100
+"""Messages of a client that are read and thrown away; the page sends none."""
 JPEG_QUALITY = 75
 LEFT, DEPTH = b"L", b"D"
 """First byte of a binary message: which image follows as JPEG."""
@@ -61,6 +64,8 @@ class Dashboard:
         self._event_count = 0
         self._clients: set[web.WebSocketResponse] = set()
         self._next_image_ns = 0
+        self._connections: Counter[str] = Counter()
+        self.on_stop: Callable[[], bool] = lambda: False
         events.subscribe(self._keep_event)
 
     @property
@@ -74,6 +79,7 @@ class Dashboard:
         app.router.add_get("/", self._page)
         app.router.add_get("/ws", self._socket)
         app.router.add_get("/api/state", self._state)
+        app.router.add_post("/api/stop", self._stop)
         app.router.add_static("/pages", PAGES)
         app.on_response_prepare.append(_add_headers)
         app.on_shutdown.append(self._close_clients)
@@ -81,15 +87,21 @@ class Dashboard:
 
     async def run(self, config: DashboardConfig) -> None:
         """Serve until cancelled; raises DeviceNotFoundError when the address is taken."""
-        runner = web.AppRunner(self.application(), access_log=None, shutdown_timeout=1.0)
+        runner = web.AppRunner(self.application(), access_log=None, shutdown_timeout=1.0, keepalive_timeout=IDLE_S)
         await runner.setup()
+        assert runner.server is not None
+        listening = None
         try:
-            await web.TCPSite(runner, config.host, config.port).start()
+            listening = await asyncio.get_running_loop().create_server(
+                limited(runner.server, self._connections), config.host, config.port
+            )
             await self.watch()
         except OSError as error:
             where = f"{config.host}:{config.port}"
             raise DeviceNotFoundError(f"the dashboard cannot listen on {where} ({error.strerror}).") from None
         finally:
+            if listening is not None:
+                listening.close()
             await runner.cleanup()
 
     async def watch(self) -> None:
@@ -130,11 +142,18 @@ class Dashboard:
         shown = snapshot(self._topics, self._clock.now_ns(), self._start_ns)
         return web.json_response({"identity": self._identity, **shown, "events": self._events_after(0)})
 
+    async def _stop(self, request: web.Request) -> web.Response:
+        """Ask the safety monitor to brake. Only the page itself may: a foreign page cannot set the header."""
+        if not _same_origin(request) or request.headers.get("X-MorphEyes") != "stop":
+            raise web.HTTPForbidden(text="only this daemon's own page may ask for a stop.")
+        if not self.on_stop():
+            raise web.HTTPServiceUnavailable(text="the flight process does not take the request.")
+        return web.json_response({"asked": True})
+
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         if len(self._clients) >= CLIENTS:
             raise web.HTTPServiceUnavailable(text=f"{CLIENTS} pages are open already; close one.")
-        origin = request.headers.get("Origin")
-        if origin is not None and origin.partition("://")[2] != request.host:
+        if not _same_origin(request):
             raise web.HTTPForbidden(text="only this daemon's own page may look.")
         socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=10.0, compress=False)
         self._clients.add(socket)
@@ -191,10 +210,18 @@ async def _send(socket: web.WebSocketResponse, content: str | bytes) -> None:
         await (socket.send_str(content) if isinstance(content, str) else socket.send_bytes(content))
 
 
+def _same_origin(request: web.Request) -> bool:
+    origin = request.headers.get("Origin")
+    return origin is None or origin.partition("://")[2] == request.host
+
+
 async def _ignore(socket: web.WebSocketResponse) -> None:
-    """Read what the client says, so that its goodbye is heard, and throw it away."""
+    """Read what the client says, so that its goodbye is heard, and throw it away; one that goes on talking is cut."""
+    heard = 0
     async for _ in socket:
-        pass
+        heard += 1
+        if heard > MOST_MESSAGES:
+            return
 
 
 async def _add_headers(request: web.Request, response: web.StreamResponse) -> None:

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import Clock
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.devices.camera import build_camera
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.doctor.findings import Finding, Severity
@@ -53,12 +53,14 @@ async def examine(
     findings, rig = examine_calibration(config)
     report.add("calibration", findings)
     tell("the servo")
-    servo = build_servo(config.servo, opener, clock, EventLog())
+    servo = build_servo(config.servo, DeviceContext.alone(clock, opener))
     findings, placed = await examine_servo(servo, config)
     report.add("servo", findings)
     tell("the camera")
     eyes = rig if placed else None
-    report.add("camera", await examine_camera(lambda: build_camera(config.camera, clock), config, eyes))
+    report.add(
+        "camera", await examine_camera(lambda: build_camera(config.camera, DeviceContext.alone(clock)), config, eyes)
+    )
     tell("the autopilot")
     async with VehicleExamination(config, clock, opener) as vehicle:
         if config.autopilot.mavsdk:

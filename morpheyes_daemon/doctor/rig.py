@@ -17,7 +17,7 @@ from morpheyes_daemon.devices.servo import Servo
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.errors import CalibrationError, ConfigError, DeviceError, InputError, MorphEyesError
 from morpheyes_daemon.messages.core import BaselineEstimate, RawPair, StereoFrame
-from morpheyes_daemon.stereo.calibration_file import read_calibration
+from morpheyes_daemon.perception.craft import fitting_rig
 from morpheyes_daemon.stereo.depth import DepthEstimator
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.theory.sync import sync_speed_bound_m_s
@@ -34,16 +34,19 @@ SYNC_SPEED_M_S = 0.3
 
 
 def examine_calibration(config: VehicleConfig) -> tuple[list[Finding], RigModel | None]:
-    """Return the findings on the calibration file, and the rig when it can be used."""
+    """Return the findings on the calibration file, and the rig at the camera's size when it can be used."""
     if config.calibration is None:
         return [_unusable("calibration is not set in config.yaml")], None
     try:
-        rig = read_calibration(config.calibration).rescaled(config.camera.width_px, config.camera.height_px)
-        for baseline_m in config.baseline_range_m:
-            rig.T_cam0_cam1(baseline_m)
+        rig = fitting_rig(config.calibration, config)
     except (CalibrationError, ConfigError) as error:
         return [_unusable(str(error))], None
-    return [*_calibration_verdict(rig, config), *_mount(rig, config), *_sync(rig, config)], rig
+    return examine_rig(rig, config), rig.rescaled(config.camera.width_px, config.camera.height_px)
+
+
+def examine_rig(rig: RigModel, config: VehicleConfig) -> list[Finding]:
+    """Return the findings on a calibrated rig that fits the vehicle."""
+    return [*_calibration_verdict(rig, config), *_mount(rig, config), *_sync(rig, config)]
 
 
 def _unusable(evidence: str) -> Finding:

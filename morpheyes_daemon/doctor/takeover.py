@@ -15,10 +15,10 @@ from morpheyes_daemon.clock import MS, Clock, S, Ticker
 from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.control.loiter import LoiterModel
 from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
+from morpheyes_daemon.devices.autopilot.stick_output import ChannelMap
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import VehicleState
-from morpheyes_daemon.messages.safety import Widths
 from morpheyes_daemon.wire.mavlink import RELEASE, ChannelOverride
 
 PATIENCE_S = 60.0
@@ -60,7 +60,9 @@ class TakeoverTest:
         self._say = say
         model = LoiterModel.from_parameters(connection.parameters.values)
         roll, pitch, _, yaw = model.neutral
-        self._marked: Widths = model.channels((roll + MARK_US, pitch, max(THROTTLE_LOW_US, model.minimum[2]), yaw))
+        channel_map = ChannelMap.from_parameters(connection.parameters.values)
+        sticks = (roll + MARK_US, pitch, max(THROTTLE_LOW_US, model.minimum[2]), yaw)
+        self._marked = channel_map.override(sticks).channels_us
         self._state = VehicleState()
         self._wish: Callable[[VehicleState], bool] | None = None
         self._heard_ns = 0

@@ -9,11 +9,11 @@ import asyncio
 import math
 from collections.abc import Callable
 
-from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config.vehicle import VehicleConfig
-from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
 from morpheyes_daemon.devices.autopilot.mavsdk_bridge import MavsdkBridge
+from morpheyes_daemon.devices.autopilot.session import AutopilotSession
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.doctor.parameter_rules import examine_parameters
@@ -35,23 +35,25 @@ class VehicleExamination:
     def __init__(self, config: VehicleConfig, clock: Clock, opener: LinkOpener) -> None:
         self._config = config
         self._clock = clock
-        self._topics, self._events = Topics.create(), EventLog()
+        context = DeviceContext.alone(clock, opener)
         self._last_event: Event | None = None
-        self._events.subscribe(self._remember)
-        self.connection = AutopilotConnection(config.autopilot, clock, self._topics, self._events, opener)
+        context.events.subscribe(self._remember)
+        self._session = AutopilotSession(config.autopilot, context)
+        self.connection = self._session.connection
         self._stamps: dict[str, set[int]] = {name: set() for name in SLOWEST_HZ}
         self._words: list[str] = []
         self._bridge: MavsdkBridge | None = None
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self) -> VehicleExamination:
-        self._tasks = [asyncio.create_task(self.connection.run(), name="autopilot")]
+        await self._session.__aenter__()
         return self
 
     async def __aexit__(self, *error: object) -> None:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._session.__aexit__(None, None, None)
 
     def with_mavsdk(self) -> None:
         """Let mavsdk listen too; it needs real time."""
@@ -61,7 +63,7 @@ class VehicleExamination:
     @property
     def vehicle(self) -> VehicleState:
         """The newest state."""
-        return self._topics.vehicle.get() or VehicleState()
+        return self._session.vehicle
 
     async def examine(self) -> list[Finding]:
         """Return the findings on link, parameters, state and the autopilot's own checks."""
@@ -83,11 +85,10 @@ class VehicleExamination:
         ]
 
     async def wait(self, done: Callable[[], bool], limit_s: float) -> bool:
-        """Wait until `done()` is true or `limit_s` is over and return which; what ended the connection is raised here."""
+        """Wait until `done()` is true or `limit_s` is over and return which; raises what ended the connection."""
         end_ns = self._clock.now_ns() + round(limit_s * S)
         while not done():
-            if self._tasks[0].done():
-                self._tasks[0].result()
+            self._session.check()
             if self._clock.now_ns() >= end_ns:
                 return False
             await self._clock.sleep_until_ns(self._clock.now_ns() + S // 50)

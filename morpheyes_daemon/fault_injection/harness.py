@@ -19,6 +19,7 @@ from typing import Self
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, VirtualLoop, running_clock
 from morpheyes_daemon.daemon.composition import Daemon, Parts
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceTimeoutError
 from morpheyes_daemon.fault_injection.injectors import FaultyCamera, FaultyWorker, Wire, lose
@@ -38,6 +39,7 @@ from morpheyes_daemon.perception.pipeline import PipelineFactory
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
+from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.vision_worker.inline import InlineWorker
 
 NEUTRAL_US = (1500, 1500, 1500, 1500)
@@ -103,13 +105,13 @@ class FaultFlight:
         opener = memory_opener(self.stage)
         self.wire, self.servo_wire = Wire(opener), Wire(opener)
         self.camera = FaultyCamera(SimVehicleCamera(self.stage, plan.config.camera.rate_hz))
-        pipeline = PipelineFactory(plan.config, plan.mission, plan.calibration)()
+        pipeline = PipelineFactory(plan.config, plan.mission, read_calibration(plan.calibration))()
         latency_ns = round(plan.config.stereo.latency_ms * S / 1e3)
         self.worker = FaultyWorker(InlineWorker(pipeline.perceive, latency_ns, self.clock), self.clock)
         self._parts = Parts(
             clock=self.clock,
             camera=self.camera,
-            servo=build_servo(plan.config.servo, self.servo_wire.open, self.clock, events),
+            servo=build_servo(plan.config.servo, DeviceContext(self.clock, events, topics, self.servo_wire.open)),
             opener=self.wire.open,
             worker=self.worker,
         )
@@ -202,8 +204,9 @@ class FaultFlight:
         self.wire.on_sent = self._note
         parts, events = self._parts, EventLog()
         parts.opener = self.wire.open
-        parts.servo = build_servo(self.plan.config.servo, Wire(opener).open, self.clock, events)
-        self.daemon = Daemon(self.plan.config, self.plan.mission, parts, Topics.create(), events)
+        topics = Topics.create()
+        parts.servo = build_servo(self.plan.config.servo, DeviceContext(self.clock, events, topics, Wire(opener).open))
+        self.daemon = Daemon(self.plan.config, self.plan.mission, parts, topics, events)
         self._life = asyncio.create_task(self.daemon.run(self.stop))
         self._tasks.append(self._life)
 

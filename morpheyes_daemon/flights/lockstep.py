@@ -25,6 +25,7 @@ from morpheyes_daemon.config.vehicle import (
     VehicleConfig,
 )
 from morpheyes_daemon.daemon.composition import Daemon, Parts
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import Link, LinkOpener, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceNotFoundError
@@ -147,13 +148,13 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
     stage = SimVehicle(plan.scenario, plan.config, clock, plan.threads)
     crew = make_crew(stage)
     opener = memory_opener(stage)
-    pipeline = PipelineFactory(plan.config, plan.mission, plan.calibration)()
+    pipeline = PipelineFactory(plan.config, plan.mission, read_calibration(plan.calibration))()
     latency_ns = round(plan.config.stereo.latency_ms * S / 1e3)
     pool = ThreadPoolExecutor(1) if plan.threads > 1 else None
     parts = Parts(
         clock=clock,
         camera=SimVehicleCamera(stage, plan.config.camera.rate_hz),
-        servo=build_servo(plan.config.servo, opener, clock, events),
+        servo=build_servo(plan.config.servo, DeviceContext(clock, events, topics, opener)),
         opener=opener,
         worker=InlineWorker(pipeline.perceive, latency_ns, clock, pool),
         image_rate_hz=watchers.image_rate_hz,

@@ -11,7 +11,7 @@ import json
 import multiprocessing
 import tempfile
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, closing
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -19,9 +19,10 @@ from typing import Any
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, running_clock, stopwatch_s, wall_time_s
-from morpheyes_daemon.config.vehicle import AutopilotConfig, SerialServoConfig, VehicleConfig
+from morpheyes_daemon.config.vehicle import AutopilotConfig, DashboardConfig, SerialServoConfig, VehicleConfig
 from morpheyes_daemon.daemon.composition import Daemon
 from morpheyes_daemon.daemon.service import build_parts, real_time_runner
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.errors import DeviceLostError, DeviceTimeoutError
 from morpheyes_daemon.flights.artifacts import FILES
 from morpheyes_daemon.flights.lockstep import FlightPlan, Progress, Summary, Tally, summarize_flight
@@ -29,13 +30,17 @@ from morpheyes_daemon.flights.referee import Verdict
 from morpheyes_daemon.flights.simulator_process import End, PilotAct, Ready, SimulatorJob, simulate
 from morpheyes_daemon.flights.stick_timing import StickIntervals, StickTiming
 from morpheyes_daemon.messages.core import Perception
+from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import GateOutput
-from morpheyes_daemon.perception.pipeline import VisionJob
+from morpheyes_daemon.observer.feed import Feed
+from morpheyes_daemon.observer.process import ObserverJob
+from morpheyes_daemon.observer.task import ObserverTask
+from morpheyes_daemon.perception.pipeline import PipelineFactory, VisionJob
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.reader import read_flight
-from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.report import draw_report
 from morpheyes_daemon.stereo.calibration_file import calibration_hash, read_calibration
+from morpheyes_daemon.supervisor.supervisor import Task
 from morpheyes_daemon.vision_worker.process import ProcessWorker
 
 READY_LIMIT_S = 600.0
@@ -189,6 +194,7 @@ class RealtimeFlight:
     running: asyncio.Task[None]
     tally: Tally
     beat: StickTiming
+    observer: ObserverTask
 
     async def verdict(self) -> Verdict:
         """Wait for the judge; raises what ended the simulator or the daemon before."""
@@ -202,9 +208,16 @@ class RealtimeFlight:
 
 @asynccontextmanager
 async def realtime_daemon(
-    plan: FlightPlan, log: Path, autopilot: str | None, progress: Callable[[Progress], None]
+    plan: FlightPlan,
+    log: Path,
+    autopilot: str | None,
+    progress: Callable[[Progress], None],
+    page: DashboardConfig | None = None,
 ) -> AsyncIterator[RealtimeFlight]:
-    """Run simulator and daemon beside the body; at its end the daemon leaves in neutral, then release."""
+    """Run simulator and daemon beside the body; at its end the daemon leaves in neutral, then release.
+
+    `page` serves the dashboard, None none.
+    """
     clock, topics, events = running_clock(), Topics.create(), EventLog()
     with tempfile.TemporaryDirectory(prefix="morpheyes-") as place:
         address = f"unix:{place}/frames"
@@ -212,20 +225,34 @@ async def realtime_daemon(
         async with simulator_process(job, progress) as simulator:
             ready = await simulator.get_ready()
             config = device_config(plan, ready, address)
-            parts = build_parts(config, plan.mission, clock, events, film=True)
+            parts = build_parts(
+                PipelineFactory(config, plan.mission, read_calibration(plan.calibration)),
+                DeviceContext(clock, events, topics),
+                film=True,
+            )
             worker = parts.worker
             assert isinstance(worker, ProcessWorker)
             daemon = Daemon(config, plan.mission, parts, topics, events)
+            observer = ObserverTask(
+                _observer_job(plan, config, log, ready.scene_json, page),
+                Feed(topics, events, clock),
+                clock,
+                lambda request: daemon.monitor.stop_requested(clock.now_ns()),
+            )
+            daemon.supervisor.add(Task("observer", observer.run, Reason.TASK_DIED, essential=False))
             watchers = Tally(topics, events), StickTiming(topics.gate)
             topics.gate.tap(simulator.tell)
-            with closing(_recorder(plan, config, daemon, log, ready.scene_json)):
-                stop = asyncio.Event()
-                running = asyncio.create_task(daemon.run(stop))
+            await observer.start()
+            stop = asyncio.Event()
+            running = asyncio.create_task(daemon.run(stop))
+            try:
+                yield RealtimeFlight(daemon, worker, simulator, running, *watchers, observer)
+            finally:
+                stop.set()
                 try:
-                    yield RealtimeFlight(daemon, worker, simulator, running, *watchers)
-                finally:
-                    stop.set()
                     await running
+                finally:
+                    await observer.close()
 
 
 def device_config(plan: FlightPlan, ready: Ready, camera_address: str) -> VehicleConfig:
@@ -243,7 +270,9 @@ def device_config(plan: FlightPlan, ready: Ready, camera_address: str) -> Vehicl
     )
 
 
-def _recorder(plan: FlightPlan, config: VehicleConfig, daemon: Daemon, log: Path, scene_json: str) -> Recorder:
+def _observer_job(
+    plan: FlightPlan, config: VehicleConfig, log: Path, scene_json: str, page: DashboardConfig | None
+) -> ObserverJob:
     log.parent.mkdir(parents=True, exist_ok=True)
     for name in FILES:
         (log.parent / name).unlink(missing_ok=True)
@@ -255,5 +284,12 @@ def _recorder(plan: FlightPlan, config: VehicleConfig, daemon: Daemon, log: Path
         wall_s=wall_time_s(),
         scene=scene_json,
     )
-    rate_hz = plan.config.camera.rate_hz
-    return Recorder(daemon.topics, daemon.events, running_clock(), log, header, image_rate_hz=rate_hz, threaded=True)
+    return ObserverJob(
+        log=log,
+        header=header,
+        image_rate_hz=plan.config.camera.rate_hz,
+        page=page,
+        identity={"mission": plan.mission_name, "seed": str(plan.scenario.seed), "calibration": str(plan.calibration)},
+        journal=None,
+        began_ns=running_clock().now_ns(),
+    )

@@ -67,7 +67,7 @@ class Referee:
 
     def __init__(self, stage: SimVehicle, monitor: Reported, gate: Latest[GateOutput], limit_s: float) -> None:
         self._stage = stage
-        self._guardian = monitor
+        self._monitor = monitor
         self._limit_s = limit_s
         self._engaged = False
         self._engaged_ns = 0
@@ -110,7 +110,7 @@ class Referee:
         self._baselines = (min(self._baselines[0], baseline_m), max(self._baselines[1], baseline_m))
 
     def _decide(self, now_ns: int) -> tuple[Outcome, str] | None:
-        state, reason = self._guardian.state, self._guardian.reason
+        state, reason = self._monitor.state, self._monitor.reason
         if self._clearance_m < 0.0:
             v = self._stage.truth(now_ns).v_ned_m_s
             depth, speed = -self._clearance_m * 1e3, math.hypot(*v)
@@ -128,7 +128,7 @@ class Referee:
             return Outcome.ABORTED, f"believed to be at the goal, {off_m:.1f} m from it"
         if reason is Reason.MISSION_REFUSED:
             return Outcome.REFUSED, reason
-        if reason not in REQUESTED_STOPS and now_ns - self._guardian.since_ns > GIVEN_UP_S * S:
+        if reason not in REQUESTED_STOPS and now_ns - self._monitor.since_ns > GIVEN_UP_S * S:
             return Outcome.ABORTED, reason
         return None
 

@@ -52,7 +52,7 @@ class BaselineEstimate:
 class RawPair:
     """What a camera backend delivers: two uint8 images (H, W) or (H, W, 3) BGR, same size.
 
-    `t_ns` is mid-exposure of the left eye; `sync_error_s` bounds the time between the eyes.
+    `t_ns` is mid-exposure of the left camera; the right one exposes within camera.sync_error_ms of it.
     """
 
     seq: int
@@ -185,7 +185,6 @@ class VehicleState:
     sensors_present: int = 0
     sensors_health: int = 0
     gps_fix: int = -1
-    battery_t_ns: int = 0
     battery_v: float = math.nan
     battery_fraction: float = math.nan
     gcs_t_ns: int = 0

@@ -28,6 +28,7 @@ class Reason(StrEnum):
     MISSION_REFUSED = "mission_refused", 5, "the mission judged the task not safely possible"
     SHUTDOWN = "shutdown", 6, "the daemon was asked to stop"
     RECOVERED = "recovered", 7, "the missing input is back"
+    STOP_REQUESTED = "stop_requested", 8, "somebody asked for a stop on the page"
 
     # the pilot
     SWITCH_OFF = "switch_off", 20, "the pilot's switch is off"

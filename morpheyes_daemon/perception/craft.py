@@ -18,14 +18,15 @@ from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rpy, pose
 
 
 def fitting_rig(calibration: Path, config: VehicleConfig) -> RigModel:
-    """Return the calibrated rig at the camera's size.
+    """Return the rig of a calibration file.
 
     Raises CalibrationError when it is another camera's, or lacks baselines that the vehicle may be asked for.
     """
-    rig = read_calibration(calibration).rescaled(config.camera.width_px, config.camera.height_px)
+    rig = read_calibration(calibration)
     try:
+        scaled = rig.rescaled(config.camera.width_px, config.camera.height_px)
         for baseline_m in config.baseline_range_m:
-            rig.T_cam0_cam1(baseline_m)
+            scaled.T_cam0_cam1(baseline_m)
     except CalibrationError as error:
         raise CalibrationError(f"{calibration}: {error}") from None
     return rig

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -37,7 +36,6 @@ from morpheyes_daemon.perception.image_checks import (
     exposure_faults,
     matching_faults,
 )
-from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.stereo.depth import DepthEstimator, RectifiedPair, disparity_of
 from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
 from morpheyes_daemon.stereo.rig import RigModel
@@ -65,10 +63,10 @@ class PipelineFactory:
 
     config: VehicleConfig
     mission: MissionFile
-    calibration: Path
+    rig: RigModel
 
     def __call__(self) -> Pipeline:
-        return Pipeline(self.config, self.mission, read_calibration(self.calibration))
+        return Pipeline(self.config, self.mission, self.rig)
 
 
 class Pipeline:

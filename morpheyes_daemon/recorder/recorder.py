@@ -68,7 +68,9 @@ class Recorder:
         *,
         image_rate_hz: float | None,
         threaded: bool,
+        log_every: Mapping[str, int] | None = None,
     ) -> None:
+        """`log_every` n keeps each n-th value of a topic; None takes what the topics themselves say."""
         self._clock = clock
         self._events = events
         self._log = FlightLog(path, header)
@@ -84,7 +86,7 @@ class Recorder:
         self._loop = asyncio.get_running_loop() if threaded else None
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True) if threaded else None
         self._log.add(ned_entry(clock.now_ns()), clock.now_ns(), clock.now_ns())
-        self._tap(topics, events)
+        self._tap(topics, events, log_every)
         if self._thread is not None:
             self._thread.start()
 
@@ -117,10 +119,10 @@ class Recorder:
 
     # -- the publisher's side -------------------------------------------------------------------------------
 
-    def _tap(self, topics: Topics, events: EventLog) -> None:
+    def _tap(self, topics: Topics, events: EventLog, log_every: Mapping[str, int] | None) -> None:
         events.subscribe(self._take_event)
         for topic in fields(topics):
-            every = topic.metadata["log_every"]
+            every = topic.metadata["log_every"] if log_every is None else log_every[topic.name]
             if every:
                 getattr(topics, topic.name).tap(self._taker(topic.name, every))
 

@@ -6,7 +6,6 @@ the vehicle is held still and turned otherwise than in those kept before; it is 
 
 from __future__ import annotations
 
-import asyncio
 import csv
 import math
 from collections.abc import Callable
@@ -16,12 +15,12 @@ from typing import Self
 
 import numpy as np
 
-from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.calibration.mount import ATTITUDES, COLUMNS, attitude_rows
 from morpheyes_daemon.calibration.targets.boards import Board, find_corners
 from morpheyes_daemon.clock import Clock, S
 from morpheyes_daemon.config.vehicle import VehicleConfig
-from morpheyes_daemon.devices.autopilot.connection import AutopilotConnection
+from morpheyes_daemon.devices.autopilot.session import AutopilotSession
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
 from morpheyes_daemon.messages.core import Image, VehicleState
@@ -43,11 +42,10 @@ class HandHeldVehicle:
 
     def __init__(self, config: VehicleConfig, clock: Clock, opener: LinkOpener) -> None:
         self._clock = clock
-        self._topics = Topics.create()
-        self._hub = AutopilotConnection(config.autopilot, clock, self._topics, EventLog(), opener)
+        self._session = AutopilotSession(config.autopilot, DeviceContext.alone(clock, opener))
 
     async def __aenter__(self) -> Self:
-        self._task = asyncio.create_task(self._hub.run(), name="autopilot")
+        await self._session.__aenter__()
         for _ in range(round(WAIT_S * 20)):
             if self.state.attitude_t_ns:
                 return self
@@ -58,13 +56,12 @@ class HandHeldVehicle:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._task.cancel()
-        await asyncio.gather(self._task, return_exceptions=True)
+        await self._session.__aexit__(kind, error, trace)
 
     @property
     def state(self) -> VehicleState:
         """The newest state."""
-        return self._topics.vehicle.get() or VehicleState()
+        return self._session.vehicle
 
 
 async def capture_mount(

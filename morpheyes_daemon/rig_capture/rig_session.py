@@ -8,12 +8,12 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Self
 
-from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import MS, Clock
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.control.baseline import baseline_model
 from morpheyes_daemon.control.baseline_planner import OVERSHOOT_M
 from morpheyes_daemon.devices.camera import Camera, build_camera
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.devices.servo import Servo, build_servo
 from morpheyes_daemon.messages.core import RawPair
@@ -30,8 +30,9 @@ class RigSession:
     @classmethod
     def of(cls, config: VehicleConfig, clock: Clock, opener: LinkOpener) -> Self:
         """Return the stand of the configured devices, not yet open."""
-        servo = build_servo(config.servo, opener, clock, EventLog())
-        return cls(build_camera(config.camera, clock), servo, config, clock)
+        context = DeviceContext.alone(clock, opener)
+        servo = build_servo(config.servo, context)
+        return cls(build_camera(config.camera, context), servo, config, clock)
 
     async def __aenter__(self) -> Self:
         await self._servo.open()

@@ -47,7 +47,7 @@ RESUMED = frozenset(
 PILOT_UNHEARD = frozenset({Reason.LINK_LOST, Reason.RC_LOST})
 """While these last the pilot cannot be heard taking the sticks back."""
 
-REQUESTED_STOPS = (Reason.GOAL_REACHED, Reason.MISSION_REFUSED, Reason.SHUTDOWN)
+REQUESTED_STOPS = (Reason.GOAL_REACHED, Reason.MISSION_REFUSED, Reason.STOP_REQUESTED, Reason.SHUTDOWN)
 """Stops that somebody asked for, as against braking for want of something."""
 
 
@@ -181,6 +181,10 @@ class SafetyMonitor:
     def mission_over(self, reason: Reason, now_ns: int) -> None:
         """The mission is done or refuses; stop and wait for the pilot."""
         self._brake(Trigger.MISSION_OVER, reason, now_ns)
+
+    def stop_requested(self, now_ns: int) -> None:
+        """Somebody who watches asks for a stop; wait for the pilot then."""
+        self._brake(Trigger.STOP_REQUESTED, Reason.STOP_REQUESTED, now_ns)
 
     def shutdown(self, now_ns: int) -> None:
         """Neutral for a while, then release; from outside flight, done at once."""

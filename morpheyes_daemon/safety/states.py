@@ -29,6 +29,7 @@ class Trigger(StrEnum):
     FAULT = "fault"
     CLEARED = "cleared"
     MISSION_OVER = "mission_over"
+    STOP_REQUESTED = "stop_requested"
     STOPPED = "stopped"
     LET_GO = "let_go"
     SHUTDOWN = "shutdown"
@@ -76,6 +77,7 @@ CAUSE: dict[Trigger, str] = {
     Trigger.FAULT: "a part failed, the autopilot reports trouble, or a clock or loop was late",
     Trigger.CLEARED: "the last part that had failed works again",
     Trigger.MISSION_OVER: "the mission is done, or refuses",
+    Trigger.STOP_REQUESTED: "somebody pressed STOP on the page",
     Trigger.STOPPED: "at rest, or the time for braking is over",
     Trigger.LET_GO: "neutral for long enough on the way out, or the autopilot is no longer heard",
     Trigger.SHUTDOWN: "the daemon was asked to stop",
@@ -92,9 +94,11 @@ TRANSITIONS: dict[tuple[State, Trigger], State] = {
     (_S.ENGAGED, _T.STALE): _S.BRAKING,
     (_S.ENGAGED, _T.FAULT): _S.BRAKING,
     (_S.ENGAGED, _T.MISSION_OVER): _S.BRAKING,
+    (_S.ENGAGED, _T.STOP_REQUESTED): _S.BRAKING,
     (_S.BRAKING, _T.STALE): _S.BRAKING,
     (_S.BRAKING, _T.FAULT): _S.BRAKING,
     (_S.BRAKING, _T.MISSION_OVER): _S.BRAKING,
+    (_S.BRAKING, _T.STOP_REQUESTED): _S.BRAKING,
     (_S.BRAKING, _T.FRESH): _S.ENGAGED,
     (_S.BRAKING, _T.STOPPED): _S.HOLD,
     **{(state, _T.SWITCH_OFF): _S.RELEASED for state in HOLDING},

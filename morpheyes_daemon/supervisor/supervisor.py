@@ -16,6 +16,7 @@ from morpheyes_daemon.clock import Clock, S, Ticker
 from morpheyes_daemon.errors import MorphEyesError, mistake
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
+from morpheyes_daemon.safety.gate import Gate
 from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import SafetyMonitor
 
@@ -56,20 +57,25 @@ class Task:
 class Supervisor:
     """Runs a table of tasks until cancelled."""
 
-    def __init__(
-        self, tasks: list[Task], monitor: SafetyMonitor, events: EventLog, clock: Clock, lease_s: float
-    ) -> None:
-        self.tasks = tasks
-        self.pulses = {task.name: Pulse(clock) for task in tasks}
-        self._guardian = monitor
+    def __init__(self, monitor: SafetyMonitor, gate: Gate, events: EventLog, clock: Clock, lease_s: float) -> None:
+        self.tasks: list[Task] = []
+        self.pulses: dict[str, Pulse] = {}
+        self._monitor = monitor
+        self._gate = gate
         self._events = events
         self._clock = clock
         self._lease_ns = round(lease_s * S)
 
-    def add(self, task: Task) -> None:
-        """Take one more task, before `run`."""
-        self.tasks.append(task)
-        self.pulses[task.name] = Pulse(self._clock)
+    def add(self, *tasks: Task) -> None:
+        """Take rows of the task table, before `run`."""
+        for task in tasks:
+            self.tasks.append(task)
+            self.pulses[task.name] = Pulse(self._clock)
+
+    @property
+    def restarts(self) -> dict[str, int]:
+        """How often each task was restarted, by name."""
+        return {task.name: task.restarts for task in self.tasks}
 
     async def run(self) -> None:
         """Keep every task running; returns only by cancellation, with every task ended."""
@@ -81,7 +87,7 @@ class Supervisor:
     async def _renew(self) -> None:
         ticker = Ticker(self._clock, RATE_HZ)
         while True:
-            self._guardian.gate.renew(Lease.SUPERVISOR, self._clock.now_ns() + self._lease_ns)
+            self._monitor.gate.renew(Lease.SUPERVISOR, self._clock.now_ns() + self._lease_ns)
             await ticker.wait()
 
     async def _keep(self, task: Task) -> None:
@@ -106,14 +112,14 @@ class Supervisor:
         if pulse.on_first is None:
             self._events.publish(Event(now_ns, task.name, task.fault, text))
         if task.essential and pulse.count == 0:
-            self._guardian.set_missing(task.fault, task.name)
+            self._monitor.set_missing(task.fault, task.name)
         elif task.essential:
-            self._guardian.fault(task.fault, now_ns, task.name)
+            self._monitor.fault(task.fault, now_ns, task.name)
         pulse.on_first = lambda: self._recovered(task)
 
     def _recovered(self, task: Task) -> None:
         now_ns = self._clock.now_ns()
         self._events.publish(Event(now_ns, task.name, Reason.RECOVERED, f"{task.name}: works again"))
         if task.essential:
-            self._guardian.set_missing(None, task.name)
-            self._guardian.clear(task.fault, now_ns, task.name)
+            self._monitor.set_missing(None, task.name)
+            self._monitor.clear(task.fault, now_ns, task.name)

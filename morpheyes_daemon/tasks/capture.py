@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 from morpheyes_daemon.bus import Latest
@@ -13,22 +14,31 @@ from morpheyes_daemon.supervisor.supervisor import Pulse
 
 
 class BaselineHistory(Protocol):
-    """Where the eyes were."""
+    """The baseline at any moment of the last seconds."""
 
     def at(self, t_ns: int) -> BaselineEstimate:
         """Return the modelled baseline at `t_ns`."""
 
 
-async def capture(
-    camera: Camera, baseline: BaselineHistory, frames: Latest[StereoFrame], gate: Gate, lease_ns: int, pulse: Pulse
-) -> None:
-    """Publish each pair with the baseline of its own moment; raises the camera's DeviceError."""
-    try:
-        await camera.open()
-        while True:
-            pair = await camera.read()
-            frames.publish(StereoFrame(pair.seq, pair.t_ns, pair.left, pair.right, baseline.at(pair.t_ns)))
-            gate.renew(Lease.FRAME, pair.t_ns + lease_ns)
-            pulse.beat()
-    finally:
-        await camera.close()
+@dataclass(slots=True)
+class CaptureTask:
+    """Publishes each pair with the baseline at its mid-exposure; a frame counts for `lease_ns`."""
+
+    camera: Camera
+    baseline: BaselineHistory
+    frames: Latest[StereoFrame]
+    gate: Gate
+    lease_ns: int
+
+    async def run(self, pulse: Pulse) -> None:
+        """Read until cancelled; raises the camera's DeviceError."""
+        try:
+            await self.camera.open()
+            while True:
+                pair = await self.camera.read()
+                baseline = self.baseline.at(pair.t_ns)
+                self.frames.publish(StereoFrame(pair.seq, pair.t_ns, pair.left, pair.right, baseline))
+                self.gate.renew(Lease.FRAME, pair.t_ns + self.lease_ns)
+                pulse.beat()
+        finally:
+            await self.camera.close()

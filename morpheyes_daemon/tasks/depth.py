@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from morpheyes_daemon.bus import EventLog, Topics
@@ -26,36 +26,44 @@ class Worker(Protocol):
         """Return what the pipeline makes of the job; raises a DeviceError when the worker hung or died."""
 
 
-async def depth(
-    worker: Worker,
-    track: PoseHistory,
-    topics: Topics,
-    events: EventLog,
-    gate: Gate,
-    clock: Clock,
-    lease_ns: int,
-    image_rate_hz: float,
-    pulse: Pulse,
-) -> None:
-    """Have every newest frame looked at; bad images renew no lease, so they end in neutral sticks.
+@dataclass(slots=True)
+class DepthTask:
+    """Has every newest frame looked at; bad images renew no lease, so they end in neutral sticks.
 
-    Rows that drift are reported only: correcting them is the pipeline's, and what it did comes as its events.
+    A depth map counts for `lease_ns` from its exposure. `image_rate_hz` is how often the small pictures are kept.
+    Row offsets that drift are only reported here; the pipeline corrects them and tells so in its events.
     """
-    frames = topics.frame.reader()
-    next_image_ns = 0
-    faults: tuple[Reason, ...] = ()
-    while True:
-        frame = await frames.next()
-        keep = image_rate_hz > 0.0 and frame.t_ns >= next_image_ns
-        next_image_ns = frame.t_ns + round(S / image_rate_hz) if keep else next_image_ns
-        seen = await worker.compute(VisionJob(frame, track.at(frame.t_ns), keep))
-        seen = replace(seen, summary=replace(seen.summary, done_ns=clock.now_ns()))
-        for reason in (reason for reason in seen.image_faults if reason not in faults):
-            events.publish(Event(clock.now_ns(), "depth", reason, reason.text))
-        faults = seen.image_faults
+
+    worker: Worker
+    poses: PoseHistory
+    topics: Topics
+    events: EventLog
+    gate: Gate
+    clock: Clock
+    lease_ns: int
+    image_rate_hz: float
+
+    async def run(self, pulse: Pulse) -> None:
+        """Compute until cancelled; raises the worker's DeviceError."""
+        frames = self.topics.frame.reader()
+        next_image_ns = 0
+        faults: tuple[Reason, ...] = ()
+        while True:
+            frame = await frames.next()
+            keep = self.image_rate_hz > 0.0 and frame.t_ns >= next_image_ns
+            next_image_ns = frame.t_ns + round(S / self.image_rate_hz) if keep else next_image_ns
+            seen = await self.worker.compute(VisionJob(frame, self.poses.at(frame.t_ns), keep))
+            seen = replace(seen, summary=replace(seen.summary, done_ns=self.clock.now_ns()))
+            self._report(seen, faults)
+            faults = seen.image_faults
+            if not UNUSABLE_IMAGES & set(faults):
+                self.gate.renew(Lease.DEPTH, frame.t_ns + self.lease_ns)
+            self.topics.perception.publish(seen)
+            pulse.beat()
+
+    def _report(self, seen: Perception, known: tuple[Reason, ...]) -> None:
+        """Publish image faults that are new, and the pipeline's own events."""
+        for reason in (reason for reason in seen.image_faults if reason not in known):
+            self.events.publish(Event(self.clock.now_ns(), "depth", reason, reason.text))
         for event in seen.events:
-            events.publish(event)
-        if not UNUSABLE_IMAGES & set(faults):
-            gate.renew(Lease.DEPTH, frame.t_ns + lease_ns)
-        topics.perception.publish(seen)
-        pulse.beat()
+            self.events.publish(event)

@@ -20,6 +20,7 @@ from morpheyes_daemon.devices.camera import build_camera
 from morpheyes_daemon.devices.camera.recording import RecordingCamera
 from morpheyes_daemon.devices.camera.simulator import SimulatorCamera
 from morpheyes_daemon.devices.camera.v4l2 import V4l2Camera
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.errors import (
     ConfigError,
     DeviceError,
@@ -54,7 +55,7 @@ def recorded(path: Path, *, loop: bool = True, rate_hz: float = 5.0, width_px: i
 
 def read_all(config: RecordingCameraConfig, count: int) -> list[RawPair]:
     async def scene() -> list[RawPair]:
-        camera = build_camera(config, running_clock())
+        camera = build_camera(config, DeviceContext.alone(running_clock()))
         await camera.open()
         pairs = [await camera.read() for _ in range(count)]
         await camera.close()
@@ -196,7 +197,7 @@ def test_what_cannot_be_used_is_said_at_once(
     tmp_path: Path, fill: Callable[[Path], Path], width_px: int, sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):
-        build_camera(recorded(fill(tmp_path), width_px=width_px), HandClock())
+        build_camera(recorded(fill(tmp_path), width_px=width_px), DeviceContext.alone(HandClock()))
 
 
 @pytest.mark.realdata
@@ -324,7 +325,7 @@ async def test_a_webcam_that_is_absent_or_cannot_do_the_size_is_told() -> None:
         await V4l2Camera(v4l2(), MonotonicClock(), Webcam(size=(640, 480)).open).open()
     missing = V4l2CameraConfig(backend="v4l2", device="/dev/video-of-nobody")
     with pytest.raises(DeviceNotFoundError, match="video-of-nobody"):
-        await build_camera(missing, MonotonicClock()).open()
+        await build_camera(missing, DeviceContext.alone(MonotonicClock())).open()
 
 
 def sim(address: str, **size: int) -> SimCameraConfig:
@@ -359,7 +360,7 @@ async def serving(address: str, rate_hz: float = 50) -> AsyncIterator[FrameServe
 async def test_the_simulator_serves_frames_to_the_daemon(tmp_path: Path) -> None:
     address = f"unix:{tmp_path}/frames"
     async with serving(address):
-        camera = build_camera(sim(address), MonotonicClock())
+        camera = build_camera(sim(address), DeviceContext.alone(MonotonicClock()))
         await camera.open()
         pairs = [await camera.read() for _ in range(5)]
         await camera.close()
@@ -454,4 +455,4 @@ async def test_a_silent_simulator_is_a_timeout(tmp_path: Path, monkeypatch: pyte
 
 def test_the_simulated_camera_without_an_address_is_for_the_simulator_alone() -> None:
     with pytest.raises(ConfigError, match="only `morpheyes sim`"):
-        build_camera(SimCameraConfig(), HandClock())
+        build_camera(SimCameraConfig(), DeviceContext.alone(HandClock()))

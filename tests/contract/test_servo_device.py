@@ -13,6 +13,7 @@ import pytest
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import S, run_virtual, running_clock
 from morpheyes_daemon.config.vehicle import NoServoConfig, ServoMotion
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import Link, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.devices.servo.teensy import SerialServo
@@ -315,7 +316,7 @@ def test_the_fixed_rig_accepts_its_own_baseline_only() -> None:
 
     async def scene() -> None:
         config = NoServoConfig(backend="none", baseline_mm=57.7)
-        servo = build_servo(config, no_opener, running_clock(), EventLog())
+        servo = build_servo(config, DeviceContext.alone(running_clock(), no_opener))
         await servo.open()
         await servo.move(0.0577)
         with pytest.raises(DeviceError, match=r"fixed at 57\.7 mm"):

@@ -20,6 +20,7 @@ from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.clock import S, running_clock
 from morpheyes_daemon.config.vehicle import AutopilotConfig, MissionFile, ServoConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.daemon.composition import Daemon, Parts
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import Link, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.messages.core import Event, RawPair, Sticks
@@ -93,7 +94,7 @@ class NoisyDaemon:
         topics, log = Topics.create(), EventLog()
         self.events: list[Event] = []
         log.subscribe(self.events.append)
-        servo = build_servo(config.servo, self._open, clock, log)
+        servo = build_servo(config.servo, DeviceContext(clock, log, topics, self._open))
         worker: InlineWorker[Any, Any] = InlineWorker(lambda job: job, 0, clock)
         parts = Parts(clock=clock, camera=Blind(), servo=servo, opener=self._open, worker=worker)
         self.daemon = Daemon(config, mission or MissionFile(strategy="forest"), parts, topics, log)

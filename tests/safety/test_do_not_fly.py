@@ -6,11 +6,11 @@ import pytest
 
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config.vehicle import NoServoConfig, SerialServoConfig
-from morpheyes_daemon.daemon.composition import ALARMS
 from morpheyes_daemon.doctor.findings import Severity
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
+from morpheyes_daemon.supervisor.alarms import ALARMS
 from tests.safety.noisy_daemon import NoisyDaemon
 from tests.unit.doctor.test_doctor_parameters import BAD
 

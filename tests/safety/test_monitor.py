@@ -39,7 +39,7 @@ def is_in(cockpit: Actor, state: State, reason: Reason) -> None:
 # -- getting ready ----------------------------------------------------------------------------------------------
 
 
-def test_a_new_guardian_waits_for_what_the_daemon_still_misses() -> None:
+def test_a_new_monitor_waits_for_what_the_daemon_still_misses() -> None:
     actor = Actor()
     is_in(actor, State.BOOT, Reason.STARTED)
     assert actor.monitor.missing is Reason.STARTED

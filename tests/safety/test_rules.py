@@ -21,7 +21,7 @@ leases = st.sampled_from(list(Lease))
 jumps_ns = st.sampled_from((1, 19 * MS, 20 * MS, 100 * MS, 101 * MS, 300 * MS, 499 * MS, 500 * MS, 501 * MS, 3 * S))
 
 
-class GuardianRules(RuleBasedStateMachine):
+class MonitorRules(RuleBasedStateMachine):
     """Whole periods and single messages in any order; `Cockpit` and `Witness` hold the assertions."""
 
     @initialize(state=st.sampled_from(list(State)), gcs=st.none() | st.just(4.0))
@@ -140,7 +140,7 @@ class GuardianRules(RuleBasedStateMachine):
             assert EFFECTS[self.cockpit.sent[-1].state] is Action.STICKS
 
 
-GuardianRules.TestCase.settings = settings(
+MonitorRules.TestCase.settings = settings(
     max_examples=60,
     stateful_step_count=40,
     deadline=None,
@@ -148,4 +148,4 @@ GuardianRules.TestCase.settings = settings(
     database=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
-TestGuardianRules = GuardianRules.TestCase
+TestMonitorRules = MonitorRules.TestCase

@@ -36,6 +36,7 @@ fresh         .         .         .         .         engaged   .         .     
 fault         fault     fault     fault     braking   braking   .         .         .         fault
 cleared       .         .         .         .         .         .         .         .         preflight
 mission_over  .         .         .         braking   braking   .         .         .         .
+stop_requested . .        .         braking   braking   .         .         .         .
 stopped       .         .         .         .         hold      .         .         .         .
 let_go        .         .         .         released  released  released  .         .         .
 shutdown      released  released  released  braking   braking   braking   released  .         released

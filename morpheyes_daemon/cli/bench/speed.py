@@ -27,6 +27,7 @@ app.command("gap-images")(gap_images)
 
 LIMIT_P99_S, LIMIT_MAX_S = 0.025, 0.100
 LIMIT_GROWTH_PCT = 5.0
+ATTACK_P99_S, LATEST_STICK_S = 0.002, 0.060
 
 
 @app.command()
@@ -57,6 +58,37 @@ def sticks(
     ]
     say(asdict(found), rows, as_json)
     if beat.p99_s > LIMIT_P99_S or beat.max_s > LIMIT_MAX_S:
+        raise typer.Exit(1)
+
+
+@app.command()
+def attack(
+    seconds: Annotated[float, typer.Option(min=2.0, help="Length of each stretch of time.")] = 60.0,
+    pairs: Annotated[int, typer.Option(min=1, help="Quiet and attacked stretches, in turn.")] = 5,
+    size: Size = "160x120",
+    calibration: Calibration = "exact",
+    as_json: AsJson = False,
+) -> None:
+    """Measure the stick interval in real time while the page is attacked and the observer is stopped or killed.
+
+    Exit code 1 when an attacked p99 is more than 2 ms above the quiet one, or when an interval above 60 ms is not the
+    machine's own (an empty 50 Hz timer beside it shows those too).
+    """
+    from morpheyes_daemon.benchmarks.attack import bench_attack
+
+    plan = _plan(size, calibration, 2.0, 60.0)
+    found = _live(as_json, lambda show: bench_attack(plan, seconds, pairs, show))
+    rows = [
+        (
+            row.attack,
+            f"p99 {_ms(row.quiet_p99_s)} quiet, {_ms(row.attacked_p99_s)} attacked; largest {_ms(row.quiet_max_s)}, "
+            f"{_ms(row.attacked_max_s)} (empty timer {_ms(row.timer_max_s)}); {row.state}",
+        )
+        for row in found
+    ]
+    say({"rows": [row.as_json() for row in found]}, rows, as_json)
+    late = [row for row in found if row.attacked_max_s > max(LATEST_STICK_S, row.timer_max_s)]
+    if late or any(row.attacked_p99_s > row.quiet_p99_s + ATTACK_P99_S for row in found):
         raise typer.Exit(1)
 
 

@@ -1,5 +1,5 @@
 "use strict";
-/* The socket, and everything on the page that is text. The page only listens. */
+/* The socket, and everything on the page that is text. The page listens; the one thing it may ask is a stop. */
 (() => {
   const MODES = { 0: "Stabilize", 1: "Acro", 2: "AltHold", 3: "Auto", 4: "Guided", 5: "Loiter", 6: "RTL", 7: "Circle", 9: "Land",
     11: "Drift", 13: "Sport", 15: "Autotune", 16: "PosHold", 17: "Brake", 18: "Throw", 20: "GuidedNoGPS", 21: "SmartRTL", 22: "FlowHold" };
@@ -8,6 +8,12 @@
   const text = (id, value) => { if ($(id).textContent !== value) $(id).textContent = value; };
   const fixed = (value, digits) => (value === null || value === undefined ? "–" : value.toFixed(digits));
   let lastSnapshot = 0;
+
+  $("stop").addEventListener("click", async () => {
+    const answer = await fetch("/api/stop", { method: "POST", headers: { "X-MorphEyes": "stop" } }).catch(() => null);
+    text("stop", answer && answer.ok ? "STOP asked" : "STOP: no answer");
+    setTimeout(() => text("stop", "STOP"), 2000);
+  });
 
   function hello(content) {
     Strips.reset($("strips"), content.columns, content.rows);

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.bus import EventLog, Topics
+from morpheyes_daemon.bus import EventLog, OnError, Topics, call_each, raise_it
 from morpheyes_daemon.clock import MS, Clock, S, Ticker, wall_time_s
 from morpheyes_daemon.config.vehicle import AutopilotConfig
 from morpheyes_daemon.config.yaml_errors import read_text
@@ -23,6 +23,7 @@ from morpheyes_daemon.devices.autopilot.override_echo import OverrideEcho
 from morpheyes_daemon.devices.autopilot.parameters import ParameterClient
 from morpheyes_daemon.devices.autopilot.telemetry import Telemetry
 from morpheyes_daemon.devices.autopilot.transmitter import Transmitter, may_relay
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceTimeoutError
 from morpheyes_daemon.messages.core import Event, VehicleState
@@ -89,6 +90,12 @@ class AutopilotConnection:
         self._greeted_ns = 0
         self._timesync_ns = 0
         self.refused_streams: list[str] = []
+        self.on_error: OnError = raise_it
+
+    @classmethod
+    def from_config(cls, config: AutopilotConfig, context: DeviceContext) -> AutopilotConnection:
+        """Build the backend `mavlink`."""
+        return cls(config, context.clock, context.topics, context.events, context.opener)
 
     # -- what others hear ---------------------------------------------------------------------------------------
 
@@ -178,7 +185,7 @@ class AutopilotConnection:
         for message in self._decoder.feed(data):
             sender = source(message)
             if sender == self._vehicle:
-                self._take(message, now_ns)
+                call_each([lambda heard: self._take(heard, now_ns)], message, self.on_error)
             elif sender == self._gcs and message.get_type() == "HEARTBEAT":
                 self._publish(self._telemetry.take_gcs(now_ns))
             for pass_on in self._on_frame:
@@ -221,8 +228,7 @@ class AutopilotConnection:
             self._telemetry.boot.add_round_trip(message.ts1, message.tc1, now_ns)
 
     def _publish(self, state: VehicleState) -> None:
-        for callback in self._on_vehicle:
-            callback(state)
+        call_each(self._on_vehicle, state, self.on_error)
         self._topic.publish(state)
 
     def _come_up(self) -> None:
@@ -233,10 +239,19 @@ class AutopilotConnection:
     def _on_lost(self, reason: str) -> None:
         self._lost_reason = reason
 
+    def close(self) -> None:
+        """Let what is written go out and close the link; call it after `run` has been cancelled."""
+        link, self.transmitter.link = self.transmitter.link, None
+        if link is not None:
+            link.close()
+
     # -- the task -----------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Keep the link for ever; ends only by cancellation. ConfigError (a wrong address) passes through."""
+        """Keep the link for ever; ends only by cancellation. ConfigError (a wrong address) passes through.
+
+        Cancelled, it leaves the link open, since whoever cancels it may still have a release to send: `close` it then.
+        """
         back_off_s = BACK_OFF_S[0]
         while True:
             try:
@@ -249,6 +264,7 @@ class AutopilotConnection:
 
     async def _session(self) -> None:
         """From opening the port to losing it; raises DeviceError."""
+        self.close()  # a link that was left open by a task that was ended
         self._lost_reason = None
         self._decoder = Decoder(self._signing)
         link = await self._opener(self._config.url, self._on_bytes, self._on_lost)
@@ -258,9 +274,9 @@ class AutopilotConnection:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._watch())
                 group.create_task(self._keep_greeting())
-        finally:
-            self.transmitter.link = None
-            link.close()
+        except BaseExceptionGroup:
+            self.close()
+            raise
 
     async def _watch(self) -> None:
         """Twenty times a second: is it still there, does it echo, does it still stream?"""

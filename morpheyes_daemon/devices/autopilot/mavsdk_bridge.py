@@ -1,8 +1,8 @@
 """mavsdk beside the connection: health, battery, texts and actions for doctor, dashboard and ground crews.
 
-mavsdk gets the frames that the connection received over its `raw://` connection, and what it wants to send goes back
-through the connection, which filters, numbers and signs it; mavsdk opens no port. It runs threads of its own, so it has no
-place in lockstep, and nothing that keeps the vehicle safe or steers it depends on it: its flight mode reads Loiter,
+mavsdk gets the frames that were received over its own `raw://` connection, and what it wants to send goes back
+through ours, which filters, numbers and signs it; mavsdk opens no port. It runs threads of its own, so it has no place
+in lockstep, and nothing that keeps the vehicle safe or steers it depends on it: its flight mode reads Loiter,
 Brake and FlowHold all as HOLD, and its `hold()` sends BRAKE.
 """
 
@@ -40,7 +40,7 @@ class MavsdkBridge:
     """`run` is its task; `latest` holds what mavsdk says by name, `action` its commands once the vehicle is seen."""
 
     def __init__(self, connection: AutopilotConnection, config: AutopilotConfig, clock: Clock) -> None:
-        self._hub = connection
+        self._connection = connection
         self._config = config
         self._clock = clock
         self.latest: dict[str, Received] = {}
@@ -58,11 +58,11 @@ class MavsdkBridge:
         try:
             if native.add_any_connection(_RAW) != 0:
                 raise DeviceError("mavsdk cannot open its raw connection; set autopilot.mavsdk to false.")
-            native.subscribe_raw_bytes_to_be_sent(lambda data: loop.call_soon_threadsafe(self._hub.relay, data))
-            self._hub.on_frame(native.pass_received_raw_bytes)
+            native.subscribe_raw_bytes_to_be_sent(lambda data: loop.call_soon_threadsafe(self._connection.relay, data))
+            self._connection.on_frame(native.pass_received_raw_bytes)
             await self._follow(native)
         finally:
-            self._hub.forget_frames(native.pass_received_raw_bytes)
+            self._connection.forget_frames(native.pass_received_raw_bytes)
             self.action = None
             await loop.run_in_executor(None, native.destroy)
             settings.destroy()

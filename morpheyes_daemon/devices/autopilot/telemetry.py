@@ -113,7 +113,6 @@ class Telemetry:
     def _status(self, message: Message, now_ns: int) -> dict[str, Any]:
         known_v, known_share = message.voltage_battery != 65535, message.battery_remaining >= 0
         return {
-            "battery_t_ns": now_ns,
             "battery_v": message.voltage_battery / 1000.0 if known_v else math.nan,
             "battery_fraction": message.battery_remaining / 100.0 if known_share else math.nan,
             "sensors_present": message.onboard_control_sensors_present,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from morpheyes_daemon.clock import Clock
-from morpheyes_daemon.config.vehicle import CameraConfig, RecordingCameraConfig, V4l2CameraConfig
-from morpheyes_daemon.errors import ConfigError
+from morpheyes_daemon.config.vehicle import CameraConfig
+from morpheyes_daemon.devices.family import DeviceContext, Family
 from morpheyes_daemon.messages.core import RawPair
 
 
@@ -23,21 +22,17 @@ class Camera(Protocol):
         """Close; may be called twice, and the camera may be opened again."""
 
 
-def build_camera(config: CameraConfig, clock: Clock) -> Camera:
+CAMERAS = Family(
+    "camera",
+    {
+        "recording": "morpheyes_daemon.devices.camera.recording:RecordingCamera",
+        "sim": "morpheyes_daemon.devices.camera.simulator:SimulatorCamera",
+        "v4l2": "morpheyes_daemon.devices.camera.v4l2:V4l2Camera",
+    },
+)
+
+
+def build_camera(config: CameraConfig, context: DeviceContext) -> Camera:
     """Return the configured backend, not yet open; ConfigError or InputError when it can never work."""
-    if isinstance(config, RecordingCameraConfig):
-        from morpheyes_daemon.devices.camera.recording import RecordingCamera
-
-        return RecordingCamera(config, clock)
-    if isinstance(config, V4l2CameraConfig):
-        from morpheyes_daemon.devices.camera.v4l2 import V4l2Camera
-
-        return V4l2Camera(config, clock)
-    if config.address is None:
-        raise ConfigError(
-            "camera.backend is sim without an address, which only `morpheyes sim` can fly; "
-            "set camera.backend to v4l2 or recording, or camera.address to a simulator's socket."
-        )
-    from morpheyes_daemon.devices.camera.simulator import SimulatorCamera
-
-    return SimulatorCamera(config.address, config)
+    camera: Camera = CAMERAS.build(config, context)
+    return camera

@@ -17,6 +17,7 @@ import numpy as np
 
 from morpheyes_daemon.clock import Clock, Ticker
 from morpheyes_daemon.config.vehicle import RecordingCameraConfig
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.errors import DeviceLostError, InputError
 from morpheyes_daemon.messages.core import Image, RawPair, frozen
 
@@ -38,6 +39,11 @@ class Source(Protocol):
 
 class RecordingCamera:
     """A `Camera` over a recording; InputError when there is nothing usable at the path."""
+
+    @classmethod
+    def from_config(cls, config: RecordingCameraConfig, context: DeviceContext) -> RecordingCamera:
+        """Build the backend `recording`; raises InputError when there is no recording at its path."""
+        return cls(config, context.clock)
 
     def __init__(self, config: RecordingCameraConfig, clock: Clock) -> None:
         self._config, self._clock = config, clock

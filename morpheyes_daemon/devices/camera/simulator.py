@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 
-from morpheyes_daemon.config.vehicle import CameraBase
+from morpheyes_daemon.config.vehicle import CameraBase, SimCameraConfig
 from morpheyes_daemon.devices.camera.newest import NewestPair
-from morpheyes_daemon.errors import DeviceLostError, DeviceNotFoundError
+from morpheyes_daemon.devices.family import DeviceContext
+from morpheyes_daemon.errors import ConfigError, DeviceLostError, DeviceNotFoundError
 from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.wire.frames import (
     HEADER_BYTES,
@@ -25,6 +26,16 @@ SHORTEST_PATIENCE_S = 1.0
 
 class SimulatorCamera:
     """A `Camera` that receives what simulation.frame_server sends. ConfigError when the address is none."""
+
+    @classmethod
+    def from_config(cls, config: SimCameraConfig, context: DeviceContext) -> SimulatorCamera:
+        """Build the backend `sim`; raises ConfigError without the address of a simulator's socket."""
+        if config.address is None:
+            raise ConfigError(
+                "camera.backend is sim without an address, which only `morpheyes sim` can fly; "
+                "set camera.backend to v4l2 or recording, or camera.address to a simulator's socket."
+            )
+        return cls(config.address, config)
 
     def __init__(self, address: str, config: CameraBase) -> None:
         self._text, self._address, self._config = address, parse_address(address), config

@@ -19,6 +19,7 @@ from morpheyes_daemon.clock import MS, Clock, S
 from morpheyes_daemon.config.vehicle import V4l2CameraConfig
 from morpheyes_daemon.devices.camera.newest import NewestPair
 from morpheyes_daemon.devices.camera.recording import halves
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFoundError, InputError
 from morpheyes_daemon.messages.core import RawPair, frozen
 
@@ -48,6 +49,11 @@ def open_capture(device: str) -> Capture:
 
 class V4l2Camera:
     """A `Camera` over a V4L2 device; `opener` is for another source of the same shape."""
+
+    @classmethod
+    def from_config(cls, config: V4l2CameraConfig, context: DeviceContext) -> V4l2Camera:
+        """Build the backend `v4l2`."""
+        return cls(config, context.clock)
 
     def __init__(self, config: V4l2CameraConfig, clock: Clock, opener: Callable[[str], Capture] = open_capture) -> None:
         self._config, self._clock, self._opener = config, clock, opener

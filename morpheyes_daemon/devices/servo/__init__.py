@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from morpheyes_daemon.bus import EventLog
-from morpheyes_daemon.clock import Clock
-from morpheyes_daemon.config.vehicle import NoServoConfig, ServoConfig
-from morpheyes_daemon.devices.link import LinkOpener
+from morpheyes_daemon.config.vehicle import ServoConfig
+from morpheyes_daemon.devices.family import DeviceContext, Family
 
 
 class Servo(Protocol):
@@ -23,12 +21,16 @@ class Servo(Protocol):
         """Close; may be called twice."""
 
 
-def build_servo(config: ServoConfig, opener: LinkOpener, clock: Clock, events: EventLog) -> Servo:
-    """Return the configured backend, not yet open; losses and recoveries go to `events`."""
-    if isinstance(config, NoServoConfig):
-        from morpheyes_daemon.devices.servo.none import NoServo
+SERVOS = Family(
+    "servo",
+    {
+        "none": "morpheyes_daemon.devices.servo.none:NoServo",
+        "serial": "morpheyes_daemon.devices.servo.teensy:SerialServo",
+    },
+)
 
-        return NoServo(config.baseline_mm / 1e3)
-    from morpheyes_daemon.devices.servo.teensy import SerialServo
 
-    return SerialServo(config.url, config.motion, opener, clock, events)
+def build_servo(config: ServoConfig, context: DeviceContext) -> Servo:
+    """Return the configured backend, not yet open; losses and recoveries go to the context's events."""
+    servo: Servo = SERVOS.build(config, context)
+    return servo

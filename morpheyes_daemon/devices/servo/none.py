@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from morpheyes_daemon.config.vehicle import NoServoConfig
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.errors import DeviceError
 
 SAME_M = 1e-6
@@ -9,6 +11,11 @@ SAME_M = 1e-6
 
 class NoServo:
     """Accepts its one baseline and refuses every other."""
+
+    @classmethod
+    def from_config(cls, config: NoServoConfig, context: DeviceContext) -> NoServo:
+        """Build the backend `none`."""
+        return cls(config.baseline_mm / 1e3)
 
     def __init__(self, baseline_m: float) -> None:
         self._baseline_m = baseline_m

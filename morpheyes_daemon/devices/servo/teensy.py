@@ -12,7 +12,8 @@ from functools import partial
 
 from morpheyes_daemon.bus import EventLog
 from morpheyes_daemon.clock import MS, Clock, S
-from morpheyes_daemon.config.vehicle import ServoMotion
+from morpheyes_daemon.config.vehicle import SerialServoConfig, ServoMotion
+from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import Link, LinkOpener
 from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from morpheyes_daemon.messages.core import Event
@@ -35,6 +36,11 @@ ROUNDING_M = 1 / wire.UNITS_PER_M
 
 class SerialServo:
     """A `Servo` over any byte link; `status` is the newest that the Teensy said of itself."""
+
+    @classmethod
+    def from_config(cls, config: SerialServoConfig, context: DeviceContext) -> SerialServo:
+        """Build the backend `serial`."""
+        return cls(config.url, config.motion, context.opener, context.clock, context.events)
 
     def __init__(self, url: str, motion: ServoMotion, opener: LinkOpener, clock: Clock, events: EventLog) -> None:
         self._url, self._opener, self._clock, self._events = url, opener, clock, events

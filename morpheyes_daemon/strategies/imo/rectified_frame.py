@@ -21,7 +21,7 @@ Chosen: only avoid divisions by zero."""
 LENS_WIDTH_PX = 640.0
 """Image width at which lengths in pixels that are angles are given.
 
-Source: data sheet, OV5647 behind a 3.96 mm lens at 640x480, where f is 740 px (MorphEyes paper, 56.8 degrees diagonal)."""
+Source: data sheet, OV5647 behind a 3.96 mm lens at 640x480, where f is 740 px (56.8 degrees diagonal)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

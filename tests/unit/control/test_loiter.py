@@ -87,7 +87,8 @@ def test_both_generations_of_names_give_the_same_model() -> None:
 def test_reversed_and_remapped_channels() -> None:
     changes = {"RCMAP_ROLL": 4.0, "RCMAP_YAW": 1.0, "RC2_REVERSED": 1.0}
     model = LoiterModel.from_parameters(copter_parameters(**changes))
-    assert model.channels((1, 2, 3, 4)) == (4, 2, 3, 1)
+    assert model.roll.number == 4
+    assert model.yaw.number == 1
     assert model.sticks_for_speed(1.0, 0.0, 10.0)[1] > 1520
 
 

@@ -4,11 +4,11 @@ import math
 
 import pytest
 
-from morpheyes_daemon.daemon.service import event_line
 from morpheyes_daemon.daemon.systemd import SystemdReport, chain_turns
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Health, State
+from morpheyes_daemon.observer.process import event_line
 
 
 def report(state: State = State.STANDBY, reason: Reason = Reason.READY, **ages_s: float) -> Health:

@@ -23,7 +23,7 @@ def summary(**changes: Any) -> Summary:
     return Summary(**{**{field.name: kinds[str(field.type)] for field in fields(Summary)}, **changes})
 
 
-def test_what_was_last_said_of_a_reason_is_kept_but_not_the_guardian_s_own_words() -> None:
+def test_what_was_last_said_of_a_reason_is_kept_but_not_the_monitor_s_own_words() -> None:
     events = EventLog()
     tally = Tally(Topics.create(), events)
     for source, reason, text in (

@@ -16,7 +16,7 @@ from morpheyes_daemon.control.baseline_planner import BaselinePlanner
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import Intent, MissionCommand
 from morpheyes_daemon.supervisor.supervisor import Pulse
-from morpheyes_daemon.tasks.baseline import baseline
+from morpheyes_daemon.tasks.baseline import BaselineTask
 
 
 class ListeningServo:
@@ -97,17 +97,8 @@ def moved_by(servo: ListeningServo, model: BaselineModel, told: Callable[[bool],
 
     async def run() -> None:
         clock = running_clock()
-        work = baseline(
-            servo,  # type: ignore[arg-type]
-            model,
-            BaselinePlanner(motion),
-            0.1,
-            topics,
-            clock,
-            told,
-            Pulse(clock),
-        )
-        task = asyncio.create_task(work)
+        work = BaselineTask(servo, model, BaselinePlanner(motion), 0.1, topics, clock, told)
+        task = asyncio.create_task(work.run(Pulse(clock)))
         await wavering(topics)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)

@@ -6,15 +6,16 @@ import asyncio
 from types import SimpleNamespace
 from typing import Any
 
-from morpheyes_daemon.bus import Topics
+from morpheyes_daemon.bus import StickPulse, Topics
 from morpheyes_daemon.clock import MS, S, run_virtual, running_clock
 from morpheyes_daemon.control.pose_history import PoseHistory
+from morpheyes_daemon.control.stick_controller import StickController
 from morpheyes_daemon.messages.core import DepthSummary, Intent, Perception
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.supervisor.supervisor import Pulse
-from morpheyes_daemon.tasks.mission import mission
+from morpheyes_daemon.tasks.mission import MissionTask
 
 STICKS_NS, FRAMES_NS = 20 * MS, 37 * MS
 
@@ -54,20 +55,30 @@ async def fly(listed: Listed, topics: Topics, last_s: float) -> None:
     clock = running_clock()
     began_ns = clock.now_ns()
 
-    async def publish(topic: Any, period_ns: int, make: Any) -> None:
+    sent = StickPulse()
+
+    async def publish(topic: Any, period_ns: int, make: Any, then: Any = lambda: None) -> None:
         for count in range(1, 100):
             await clock.sleep_until_ns(began_ns + count * period_ns)
             topic.publish(make(count, clock.now_ns()))
+            then()
 
     jobs = [
-        mission(
-            listed,  # type: ignore[arg-type]
-            PoseHistory(), SimpleNamespace(stopping=None), listed,  # type: ignore[arg-type]
-            topics, clock, 0.3, 0.5, Pulse(clock),
-        ),
+        MissionTask(
+            strategy=listed,  # type: ignore[arg-type]
+            poses=PoseHistory(),
+            stopping=StickController(None, None),  # type: ignore[arg-type]  # no parameters yet
+            monitor=listed,  # type: ignore[arg-type]
+            gate=listed.gate,  # type: ignore[arg-type]
+            topics=topics,
+            sticks_sent=sent,
+            clock=clock,
+            reaction_s=0.3,
+            longest_s=0.5,
+        ).run(Pulse(clock)),
         publish(topics.perception, FRAMES_NS, percept),
-        publish(topics.gate, STICKS_NS, lambda count, t_ns: t_ns),
-    ]  # fmt: skip
+        publish(topics.gate, STICKS_NS, lambda count, t_ns: t_ns, sent.strike),
+    ]
     tasks = [asyncio.create_task(job) for job in jobs]
     await clock.sleep_until_ns(began_ns + round(last_s * S))
     for task in tasks:
