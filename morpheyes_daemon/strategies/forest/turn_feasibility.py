@@ -15,7 +15,7 @@ from morpheyes_daemon.transforms import Array, wrap_rad
 RESPONSE_S = 0.7
 """Time constant with which Loiter reaches a wanted velocity: 90 % of a step after 1.5 s, 2.3 time constants.
 
-Source: measured, `pytest tests/unit/control/test_velocity.py::test_steps_are_quick_without_overshoot`."""
+Source: measured, `pytest tests/unit/control/test_velocity.py::test_steps_rise_in_time_without_overshoot`."""
 
 MAX_TURN_RAD = 0.9
 """Largest turn of the course by one command.

@@ -1,4 +1,4 @@
-"""The baseline model holds the Teensy twin's truth, whatever is commanded, and says when it does not know."""
+"""The baseline model's interval contains the Teensy twin's baseline for any commands, and widens when uncertain."""
 
 import math
 
@@ -35,7 +35,7 @@ targets_m = st.integers(100, 300).map(lambda mm: mm / 1e3)
     start_mm=st.integers(100, 300),
     commands=st.lists(st.tuples(waits_ms, targets_m), min_size=1, max_size=12),
 )
-def test_three_sigma_hold_the_truth_of_any_command_sequence(
+def test_the_true_baseline_is_within_three_sigma_for_any_commands(
     seed: int, start_mm: int, commands: list[tuple[int, float]]
 ) -> None:
     clock = HandClock()
@@ -56,7 +56,7 @@ def test_three_sigma_hold_the_truth_of_any_command_sequence(
     commands=st.lists(st.tuples(waits_ms, targets_m, st.booleans()), min_size=1, max_size=10),
     stops_after=st.integers(0, 12),
 )
-def test_three_sigma_hold_the_truth_when_commands_are_doubtful(
+def test_the_true_baseline_is_within_three_sigma_with_unconfirmed_commands(
     seed: int, commands: list[tuple[int, float, bool]], stops_after: int
 ) -> None:
     clock = HandClock()
@@ -79,7 +79,7 @@ def test_three_sigma_hold_the_truth_when_commands_are_doubtful(
     seed=st.integers(0, 1000),
     commands=st.lists(st.tuples(waits_ms, targets_m, st.integers(0, 300)), min_size=1, max_size=8),
 )
-def test_an_acknowledgement_may_come_late_when_the_sending_was_noted(
+def test_an_acknowledgement_may_come_late_when_the_command_was_recorded(
     seed: int, commands: list[tuple[int, float, int]]
 ) -> None:
     clock = HandClock()
@@ -101,7 +101,7 @@ def test_before_the_first_command_only_the_range_is_known() -> None:
     assert estimate.sigma_m == pytest.approx(0.2 / math.sqrt(12), rel=0.01)
 
 
-def test_after_a_full_stroke_and_settling_the_place_is_known_to_the_repeatability() -> None:
+def test_after_settling_sigma_is_the_repeatability() -> None:
     model = BaselineModel(MOTION)
     model.on_acknowledged(0.1, 10 * S)
     assert model.at(12 * S).moving
@@ -111,7 +111,7 @@ def test_after_a_full_stroke_and_settling_the_place_is_known_to_the_repeatabilit
     assert rested.baseline_m == pytest.approx(0.1, abs=0.3e-3)
 
 
-def test_shrinking_leaves_no_backlash_and_growing_leaves_all_of_it() -> None:
+def test_backlash_adds_to_sigma_after_growing_only() -> None:
     model = BaselineModel(MOTION)
     model.on_acknowledged(0.25, 10 * S)
     model.on_acknowledged(0.2, 20 * S)
@@ -139,7 +139,7 @@ def test_a_full_stroke_takes_four_seconds() -> None:
     assert not model.at(25 * S).moving
 
 
-def test_doubt_is_wide_until_the_next_acknowledged_command() -> None:
+def test_an_unconfirmed_command_is_uncertain_until_the_next_one() -> None:
     model = BaselineModel(MOTION)
     model.on_acknowledged(0.2, 10 * S)
     model.on_unconfirmed(0.3, 20 * S)
@@ -148,7 +148,7 @@ def test_doubt_is_wide_until_the_next_acknowledged_command() -> None:
     assert model.at(40 * S).sigma_m == pytest.approx(REPEATABILITY_M, rel=0.01)
 
 
-def test_a_servo_that_is_silent_for_an_hour_costs_no_memory() -> None:
+def test_unconfirmed_commands_for_an_hour_cost_no_memory() -> None:
     model = BaselineModel(MOTION)
     for second in range(3600):
         model.on_unconfirmed(0.1 + 0.2 * (second % 2), second * S)
@@ -156,7 +156,7 @@ def test_a_servo_that_is_silent_for_an_hour_costs_no_memory() -> None:
     assert model.at(3600 * S).sigma_m > 0.05
 
 
-def test_what_is_forgotten_is_unknown_again() -> None:
+def test_before_the_history_the_baseline_is_unknown() -> None:
     model = BaselineModel(MOTION)
     for second in range(10, 100, 5):
         model.on_acknowledged(0.1 + 0.001 * second, second * S)

@@ -36,7 +36,7 @@ def test_a_rangefinder_over_a_bush_does_not_tilt_the_ground() -> None:
     assert ground_slope(seen(0.15, 0.0), HEIGHT_M - 0.8) == pytest.approx((0.15, 0.0), abs=0.03)
 
 
-def test_level_ground_is_level_and_little_seen_counts_as_level() -> None:
+def test_level_ground_and_too_few_points_give_no_slope() -> None:
     assert ground_slope(seen(0.0, 0.0), HEIGHT_M) == (0.0, 0.0)
     assert ground_slope(seen(0.2, 0.0)[:, :20], HEIGHT_M) == (0.0, 0.0)
     assert ground_slope(np.empty((3, 0)), HEIGHT_M) == (0.0, 0.0)
