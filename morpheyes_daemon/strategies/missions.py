@@ -21,7 +21,7 @@ def find_mission(mission: str) -> Path:
     if path.suffix in (".yaml", ".yml"):
         if path.is_file():
             return path
-        raise ConfigError(f"{path}: there is no such mission file.")
+        raise ConfigError(f"{path}: there is no such mission file; check the path.")
     named = shipped("missions") / f"{mission}.yaml"
     if named.is_file():
         return named

@@ -40,7 +40,10 @@ def find_strategy(name: str) -> type[Strategy]:
         except (ImportError, AttributeError) as error:
             raise ConfigError(f"the strategy {name!r} cannot be loaded: {error}.") from error
     if not (isinstance(found, type) and issubclass(found, Strategy)):
-        raise ConfigError(f"the strategy {name!r} is not a subclass of morpheyes_daemon.strategies.base.Strategy.")
+        raise ConfigError(
+            f"the strategy {name!r} is not a subclass of morpheyes_daemon.strategies.base.Strategy;"
+            " correct its entry point."
+        )
     return found
 
 
