@@ -23,6 +23,11 @@ RANGE_STEP_M = 0.5
 
 Chosen: about a vehicle's length; a smaller step costs time in the event loop."""
 
+MIN_KEEP_FRAMES = 10
+"""Frame periods for which points are kept at least, whatever `memory_s`. Unit: frames.
+
+Chosen: at 1 Hz trees that left the view are still in reach for 10 s; fewer forget them, more remember mismatches."""
+
 MIN_SPACING_NS = S // 10
 """Smallest time between remembered profiles; of closer ones only the newest is kept.
 

@@ -22,7 +22,7 @@ from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Strategy, View
 from morpheyes_daemon.strategies.command import CommandBuilder, Decision
 from morpheyes_daemon.strategies.forest.bug_algorithm import BugAlgorithm
-from morpheyes_daemon.strategies.forest.obstacle_memory import ObstacleMemory
+from morpheyes_daemon.strategies.forest.obstacle_memory import MIN_KEEP_FRAMES, ObstacleMemory
 from morpheyes_daemon.strategies.forest.parameters import OPEN_BEYOND_M, ForestParameters
 from morpheyes_daemon.strategies.forest.turn_feasibility import (
     MAX_TURN_RAD,
@@ -146,7 +146,7 @@ class Forest(Strategy):
 
     def __init__(self, parameters: ForestParameters, craft: Craft) -> None:
         super().__init__(parameters, craft)
-        self._memory = ObstacleMemory(max(parameters.memory_s, 10 * craft.frame_period_s))
+        self._memory = ObstacleMemory(max(parameters.memory_s, MIN_KEEP_FRAMES * craft.frame_period_s))
         self._turn = Pid(PidGains(*parameters.turn_gains))
         self._commands = CommandBuilder(craft.frame_period_s)
         self._goal_ned_m: tuple[float, float] | None = None
