@@ -16,10 +16,10 @@ import numpy as np
 from morpheyes_daemon.benchmarks.gapflyt_baseline import dis_flow, enclosed
 from morpheyes_daemon.campaigns.gap_ground_truth import iou
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages.core import FloatMap, Image
+from morpheyes_daemon.messages.core import FloatMap, Image, Mask
 from morpheyes_daemon.stereo.depth import grey
 from morpheyes_daemon.stereo.image_files import read_picture
-from morpheyes_daemon.strategies.gap.wall_segmentation import Mask, split_inverse
+from morpheyes_daemon.strategies.gap.wall_segmentation import segment_inverse_depth
 
 OPENING, IGNORED = 255, 128
 """In the masks; the cloth of scene A looks like a part of the hole but moves with the wall."""
@@ -129,7 +129,7 @@ def largest_hole(inverse: FloatMap) -> tuple[Mask, float, bool]:
         filtered = cv2.bilateralFilter(smooth, SMOOTH_PX, 0.3 * float(np.median(smooth)), SMOOTH_PX)
         smooth = np.asarray(filtered, dtype=np.float32)
     sigma = FLOW_SIGMA * float(np.median(np.abs(smooth)))
-    found = split_inverse(smooth.__getitem__, np.zeros(smooth.shape, np.bool_), sigma)
+    found = segment_inverse_depth(smooth.__getitem__, np.zeros(smooth.shape, np.bool_), sigma)
     if found is None:
         return np.zeros(smooth.shape, np.bool_), 0.0, False
     return enclosed(found.clusters()[0]), found.separation, found.bimodal

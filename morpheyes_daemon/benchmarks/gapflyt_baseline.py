@@ -13,8 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages.core import FloatMap, Image
-from morpheyes_daemon.strategies.gap.wall_segmentation import Mask
+from morpheyes_daemon.messages.core import FloatMap, Image, Mask
 
 STACK = 4
 """Frames beside the reference, as in their figure 4."""

@@ -8,10 +8,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from morpheyes_daemon.messages.core import FloatMap, Pinhole
+from morpheyes_daemon.messages.core import FloatMap, Mask, Pinhole
 from morpheyes_daemon.simulation.worlds.world import GapTruth
 from morpheyes_daemon.stereo.rectify import Rectification
-from morpheyes_daemon.strategies.gap.wall_segmentation import Mask
 from morpheyes_daemon.transforms import Array, inverse
 
 FRACTION_BITS = 4

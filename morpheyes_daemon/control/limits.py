@@ -11,7 +11,7 @@ from morpheyes_daemon.control.velocity import BRAKE_LEAN_RAD, VelocityTuning
 
 
 def velocity_tuning(config: VehicleConfig, model: LoiterModel) -> VelocityTuning:
-    """Return the velocity loop's bounds; without active braking a stop is neutral sticks."""
+    """Return the velocity loop's lean bounds; without `active_braking` a stop is neutral sticks."""
     lean_rad = min(math.radians(config.safety.max_lean_deg), model.lean_max_rad)
     brake_rad = min(BRAKE_LEAN_RAD, lean_rad)
     stop_rad = brake_rad if config.safety.active_braking else 0.0
@@ -19,7 +19,7 @@ def velocity_tuning(config: VehicleConfig, model: LoiterModel) -> VelocityTuning
 
 
 def governor_limits(config: VehicleConfig) -> GovernorLimits:
-    """Return the governor's bounds."""
+    """Return the governor's bounds in SI units."""
     return GovernorLimits(
         dead_daemon_s=config.safety.dead_daemon_s,
         depth_sigmas=config.safety.depth_sigmas,

@@ -1,8 +1,8 @@
-"""What ArduCopter's Loiter makes of the sticks, from the vehicle's own parameters.
+"""Model of ArduCopter's Loiter: sticks to speed and back, from the vehicle's own parameters.
 
-Loiter turns a stick into a lean angle with drag, so it settles at a speed: with the stick's deflection n beyond its
-dead zone, v = v_lim tan(n theta) / tan(theta) and time constant v_lim / (g tan(theta)). Everything here is read
-from the autopilot (RCMAP_*, RCn_*, LOIT_*, PILOT_*); nothing is assumed. No loop is closed here.
+Loiter turns a stick into a lean angle with drag, so a held stick settles at a speed: with the deflection n beyond the
+dead zone, v = v_lim tan(n theta) / tan(theta), with time constant v_lim / (g tan(theta)). Everything here is read
+from the autopilot (RCMAP_*, RCn_*, LOIT_*, PILOT_*). No loop is closed here.
 
 Sticks are always in the order roll, pitch, throttle, yaw; the autopilot link's stick output has the channel map.
 """
@@ -17,12 +17,17 @@ from functools import lru_cache
 from morpheyes_daemon.control import parameters as p
 from morpheyes_daemon.control.stopping import G_M_S2, Brake, StoppingTable
 from morpheyes_daemon.errors import DeviceError
+from morpheyes_daemon.messages.safety import Widths
 
-Widths = tuple[int, int, int, int]
+MIN_LIMIT_M_S = 0.2
+"""Smallest speed limit of Loiter, however low the vehicle flies over its flow sensor.
 
-SLOWEST_LIMIT_M_S = 0.2
-"""LOITER_SPEED_MIN: however low it flies over the flow sensor, Loiter grants this speed."""
+Source: data sheet, ArduCopter AC_Loiter.cpp, LOITER_SPEED_MIN."""
+
 _FLOW_ROWS = 16
+"""Speed limits for which stopping distances are tabulated when the flow sensor bounds the speed. Unit: rows.
+
+Chosen: interpolation error against the time to compute the table."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +57,7 @@ class StickAxis:
         return axis
 
     def require_centred(self) -> StickAxis:
-        """Return itself when the trim lies well inside; raises DeviceError when a self-centring stick cannot."""
+        """Return itself when the trim lies inside the range; raises DeviceError when it lies at an end."""
         room = min(self.trim_us - self.min_us, self.max_us - self.trim_us) - self.dead_us
         if room <= 0:
             raise DeviceError(
@@ -61,7 +66,7 @@ class StickAxis:
         return self
 
     def deflection(self, width_us: float) -> float:
-        """Return the signed share, -1...1, that Loiter sees of a pulse width (RC_Channel::pwm_to_angle_dz)."""
+        """Return the deflection, -1 to 1, that Loiter takes from a pulse width (RC_Channel::pwm_to_angle_dz)."""
         if width_us > self.trim_us + self.dead_us:
             n = (width_us - self.trim_us - self.dead_us) / (self.max_us - self.trim_us - self.dead_us)
         elif width_us < self.trim_us - self.dead_us:
@@ -71,21 +76,21 @@ class StickAxis:
         return max(-1.0, min(1.0, -n if self.reversed else n))
 
     def width_us(self, deflection: float) -> int:
-        """Return the pulse width for a signed share, stepping over the dead zone; 0 gives the trim."""
+        """Return the pulse width for a deflection, -1 to 1, outside the dead zone; 0 gives the trim."""
         n = max(-1.0, min(1.0, -deflection if self.reversed else deflection))
         if n == 0.0:
             return self.trim_us
         side = 1 if n > 0 else -1
         end_us = self.max_us if n > 0 else self.min_us
         start_us = self.trim_us + side * self.dead_us
-        # one microsecond beyond the zone at least, or rounding would turn a small command into the trim
+        # one microsecond beyond the dead zone at least, or rounding would turn a small command into the trim
         beyond = max(1, round(abs(n) * abs(end_us - start_us)))
         return start_us + side * beyond
 
 
 @dataclass(frozen=True, slots=True)
 class ThrottleAxis:
-    """The throttle stick: its dead band THR_DZ lies around mid-range, whatever its trim says."""
+    """The throttle stick: its dead band THR_DZ lies around mid-range, whatever its trim."""
 
     axis: StickAxis
     dead_band: float
@@ -115,7 +120,7 @@ class ThrottleAxis:
         return 0.0
 
     def width_us(self, climb_m_s: float) -> int:
-        """Return the pulse width for a climb rate, clipped to what PILOT_SPEED_* allow."""
+        """Return the pulse width for a climb rate, clipped to PILOT_SPEED_UP and PILOT_SPEED_DN."""
         if climb_m_s == 0.0:
             return self.neutral_us
         middle = self._control(self.neutral_us)
@@ -133,7 +138,7 @@ class ThrottleAxis:
 
 @dataclass(frozen=True, slots=True)
 class LoiterModel:
-    """Sticks to speed and back, and the distance to a stop. Immutable; make a new one when parameters change."""
+    """Sticks to speed and back, and stopping distances. Immutable; make a new one when parameters change."""
 
     roll: StickAxis
     pitch: StickAxis
@@ -168,7 +173,7 @@ class LoiterModel:
 
     @property
     def neutral(self) -> Widths:
-        """Sticks that ask for standing still at this height."""
+        """Neutral sticks: standing still at the present height."""
         return self.roll.trim_us, self.pitch.trim_us, self.throttle.neutral_us, self.yaw.trim_us
 
     @property
@@ -182,13 +187,13 @@ class LoiterModel:
         return self.roll.max_us, self.pitch.max_us, self.throttle.axis.max_us, self.yaw.max_us
 
     def limit_m_s(self, height_m: float) -> float:
-        """Return v_lim: LOIT_SPEED, or what the flow sensor leaves of it at this height above ground.
+        """Return v_lim: LOIT_SPEED, or the lower limit of the flow sensor at this height above ground.
 
-        An unknown height (NaN) gives LOIT_SPEED: the smaller stick and the longer stop.
+        An unknown height (NaN) gives LOIT_SPEED, which means the smaller stick and the longer stop.
         """
         if self.flow_rate_1_s is None or not math.isfinite(height_m):
             return self.speed_limit_m_s
-        return max(SLOWEST_LIMIT_M_S, min(self.speed_limit_m_s, self.flow_rate_1_s * height_m))
+        return max(MIN_LIMIT_M_S, min(self.speed_limit_m_s, self.flow_rate_1_s * height_m))
 
     def time_constant_s(self, height_m: float) -> float:
         """Return the time constant with which a stick's speed is approached."""
@@ -234,7 +239,7 @@ class LoiterModel:
         return self.yaw.deflection(width_us) * self.yaw_rate_max_rad_s
 
     def stopping_distance_m(self, speed_m_s: float, height_m: float, reaction_s: float = 0.0) -> float:
-        """Return the distance to standstill: `reaction_s` flown on, then neutral sticks coasting and braking."""
+        """Return the distance to standstill: `reaction_s` at the same speed, then neutral sticks."""
         return self._stopping.distance_m(speed_m_s, self.limit_m_s(height_m), reaction_s)
 
     def speed_for_distance_m(self, distance_m: float, height_m: float, reaction_s: float = 0.0) -> float:
@@ -245,7 +250,7 @@ class LoiterModel:
 def _require_plausible(
     limit_m_s: float, lean_rad: float, throttle: ThrottleAxis, yaw_rad_s: float, brake: Brake
 ) -> None:
-    """Raise DeviceError for what no vehicle flies with; the bounds lie well outside of ArduCopter's own."""
+    """Raise DeviceError for implausible parameters; the bounds lie well outside ArduCopter's own."""
     rows = (
         ("LOIT_SPEED", limit_m_s, 0.1, 100.0, "m/s"),
         ("LOIT_ANG_MAX, or two thirds of ANGLE_MAX,", lean_rad, 0.01, 1.5, "rad"),
@@ -260,7 +265,7 @@ def _require_plausible(
     )
     for name, value, low, high, unit in rows:
         if not low <= value <= high:
-            raise DeviceError(f"{name} means {value:g} {unit}, which is not from {low:g} to {high:g}: set it right.")
+            raise DeviceError(f"{name} is {value:g} {unit}, outside {low:g} to {high:g}: correct the parameter.")
 
 
 def _mapped_axes(parameters: Mapping[str, float]) -> tuple[StickAxis, StickAxis, StickAxis, StickAxis]:
@@ -275,12 +280,12 @@ def _mapped_axes(parameters: Mapping[str, float]) -> tuple[StickAxis, StickAxis,
 
 @lru_cache(maxsize=16)
 def _stopping_table(limits_m_s: tuple[float, ...], lean_max_rad: float, brake: Brake) -> StoppingTable:
-    """The autopilot changes parameters of its own in flight; those that matter here seldom do."""
+    """Cached: parameters that do not matter here change in flight, and the table takes long to compute."""
     return StoppingTable(list(limits_m_s), lean_max_rad, brake)
 
 
 def _limit_grid(limit_m_s: float) -> list[float]:
-    """Speed limits from the slowest to `limit_m_s`, equally spaced in their logarithm."""
-    low = min(SLOWEST_LIMIT_M_S, limit_m_s / 2)
+    """Return speed limits from the smallest to `limit_m_s`, equally spaced in their logarithm."""
+    low = min(MIN_LIMIT_M_S, limit_m_s / 2)
     ratio = (limit_m_s / low) ** (1.0 / (_FLOW_ROWS - 1))
     return [low * ratio**i for i in range(_FLOW_ROWS - 1)] + [limit_m_s]

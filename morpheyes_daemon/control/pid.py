@@ -1,6 +1,6 @@
 """PID control with explicit time steps and conditional anti-windup.
 
-It keeps no clock and knows no units: error, output and gains are the caller's. The output is not slewed here.
+No clock and no units: error, output and gains are the caller's. The output is not slewed here.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class PidGains:
 
 
 class Pid:
-    """One loop. The integral grows only while the output is inside its bounds or the error leads back into them."""
+    """One loop. The integral grows only while the output is inside its bounds or the error drives it back into them."""
 
     def __init__(self, gains: PidGains) -> None:
         self.gains = gains
@@ -28,11 +28,11 @@ class Pid:
 
     @property
     def integral(self) -> float:
-        """The integral's present share of the output."""
+        """The integral term of the last output, in the output's unit."""
         return self._integral
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Clear the integral and the last error."""
         self._integral = 0.0
         self._last_error = None
 

@@ -1,7 +1,7 @@
-"""Wanted velocity, heading and height to stick positions, closed on the autopilot's own velocity estimate.
+"""Velocity loop: wanted velocity, heading and height to stick positions, closed on the autopilot's velocity estimate.
 
-Loiter's drag is fed forward, the rest is a PI loop on the velocity predicted to when a lean takes hold. The loop
-bounds the lean, forwards and in braking, and does not know why a velocity is wanted: the governor has bounded it.
+Loiter's drag is fed forward, the rest is a PI loop on the velocity predicted to when a lean takes effect. The loop
+bounds the lean, in accelerating and in braking; the speed has been bounded by the governor before.
 """
 
 from __future__ import annotations
@@ -20,25 +20,55 @@ Vector2 = tuple[float, float]
 """North and east, or forward and right."""
 
 STANDSTILL_M_S = 0.05
-"""A wanted speed below this is a stop: neutral sticks, and Loiter holds the place by itself."""
+"""A wanted speed below this is a stop: neutral sticks, and Loiter holds the position by itself.
+
+Chosen: the noise of the measured velocity; a lower one keeps correcting a vehicle that stands."""
+
+ACTIVE_STOP_M_S = 3 * STANDSTILL_M_S
+"""A stop leans against the motion above this speed and is neutral sticks below.
+
+Chosen: a lower one reverses the motion, a higher one stops later."""
+
 RANGEFINDER_FRESH_S = 0.5
+"""Age up to which the rangefinder's height is used.
+
+Chosen: several periods of DISTANCE_SENSOR; an older height has left the ground below a moving vehicle."""
+
 BRAKE_LEAN_RAD = math.radians(8.0)
-"""With the drag it slows down by 2 to 4 m/s2, and a camera tilted up by 8 degrees still sees the band it flies in."""
+"""Largest lean against the motion while slowing down.
+
+Chosen: with Loiter's drag it gives 2 to 4 m/s2, and a camera tilted up by 8 degrees still sees the band it flies in; a
+larger lean stops in less room without seeing it."""
+
+MIN_STEP_S, MAX_STEP_S = 0.001, 0.1
+"""Bounds of the loop's time step.
+
+Chosen: around the stick period of 0.02 s; a longer step after a delay would jump the integral."""
+
+FIRST_STEP_S = 0.02
+"""Time step of the first call after a reset.
+
+Chosen: the stick period, since there is no last call to measure from."""
+
+MAX_STATE_AGE_S = 0.2
+"""Longest age of the measured velocity that is predicted over.
+
+Chosen: the longest latency that the loop is tuned for; a longer prediction amplifies noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class VelocityTuning:
-    """Gains and bounds; the defaults are tuned on the identified Loiter plant (tests/unit/test_velocity.py).
+    """Gains and bounds; the defaults are tuned on the identified Loiter plant (tests/unit/control/test_velocity.py).
 
-    `quick_response_1_s` takes the place of `response_1_s` on a line, where what is missing is steered by often; there,
-    the measured velocity is steadied over `steady_s`. `lean_lag_s` is how far ahead velocity is predicted, about the
-    delay of the lean. `brake_lean_rad` bounds the lean against the motion while slowing down, `stop_lean_rad` while
-    stopping (0: neutral sticks, Loiter brakes).
+    `fast_response_1_s` replaces `response_1_s` for a setpoint with `fast_response`; there the measured velocity is
+    filtered over `filter_s`. `lean_lag_s` is the time over which velocity is predicted, about the delay of the lean.
+    `brake_lean_rad` bounds the lean against the motion while slowing down, `stop_lean_rad` while stopping (0: neutral
+    sticks, Loiter brakes).
     """
 
     response_1_s: float = 2.5
-    quick_response_1_s: float = 10.0
-    steady_s: float = 0.7
+    fast_response_1_s: float = 10.0
+    filter_s: float = 0.7
     integral_1_s2: float = 0.3
     integral_limit_m_s2: float = 0.8
     lean_lag_s: float = 0.15
@@ -54,138 +84,138 @@ class VelocityTuning:
     expiry_s: float = 0.1
 
 
+@dataclass(frozen=True, slots=True)
+class VelocitySetpoint:
+    """What the loop is to reach: velocity (ned), heading and height above ground; None leaves heading or climb alone.
+
+    With a height the vertical velocity is ignored. `coast` keeps pitch and roll neutral. `fast_response` selects the
+    gain `fast_response_1_s`, for corrections towards a line rather than for flying a speed.
+    """
+
+    v_ned_m_s: tuple[float, float, float]
+    yaw_rad: float | None = None
+    height_m: float | None = None
+    coast: bool = False
+    fast_response: bool = False
+
+
 def height_above_ground_m(vehicle: VehicleState, now_ns: int) -> float:
-    """Return the rangefinder's height while it is fresh, else the height over the local origin."""
+    """Return the rangefinder's height while it is fresh, else the height above the local origin, metres."""
     if math.isfinite(vehicle.height_m) and now_ns - vehicle.height_t_ns < RANGEFINDER_FRESH_S * S:
         return vehicle.height_m
     return -vehicle.p_ned_m[2]
 
 
 class VelocityController:
-    """One per flight; call `step` at every stick period and `reset` whenever the sticks were not ours."""
+    """One per flight; call `step` at every stick period and `reset` whenever the daemon did not hold the sticks."""
 
     def __init__(self, model: LoiterModel, tuning: VelocityTuning | None = None) -> None:
         self.model = model
         self.tuning = tuning = tuning or VelocityTuning()
-        gains = PidGains(tuning.response_1_s, tuning.integral_1_s2, i_limit=tuning.integral_limit_m_s2)
-        quick = PidGains(tuning.quick_response_1_s, tuning.integral_1_s2, i_limit=tuning.integral_limit_m_s2)
-        self._calm, self._quick = (Pid(gains), Pid(gains)), (Pid(quick), Pid(quick))
-        self._felt: Vector2 = (0.0, 0.0)
-        self._steady: Vector2 | None = None
+        normal = PidGains(tuning.response_1_s, tuning.integral_1_s2, i_limit=tuning.integral_limit_m_s2)
+        fast = PidGains(tuning.fast_response_1_s, tuning.integral_1_s2, i_limit=tuning.integral_limit_m_s2)
+        self._normal, self._fast = (Pid(normal), Pid(normal)), (Pid(fast), Pid(fast))
+        self._modelled_m_s2: Vector2 = (0.0, 0.0)
+        self._filtered_m_s: Vector2 | None = None
         self._last_ns = 0
 
     def reset(self) -> None:
-        """Forget the integrals and what was commanded."""
-        self._forget()
-        self._felt = (0.0, 0.0)
-        self._steady = None
+        """Clear the integrals, the modelled lean and the filtered velocity."""
+        self._reset_loops()
+        self._modelled_m_s2 = (0.0, 0.0)
+        self._filtered_m_s = None
         self._last_ns = 0
 
-    def _forget(self) -> None:
-        for loop in (*self._calm, *self._quick):
+    def _reset_loops(self) -> None:
+        for loop in (*self._normal, *self._fast):
             loop.reset()
 
-    def step(
-        self,
-        now_ns: int,
-        v_ned_m_s: tuple[float, float, float],
-        yaw_rad: float | None,
-        height_m: float | None,
-        vehicle: VehicleState,
-        coast: bool = False,
-        quick: bool = False,
-    ) -> Sticks:
-        """Return the sticks for a wanted velocity (ned), heading and height; None leaves heading or climb alone.
-
-        With a height the wanted vertical speed is ignored. `coast` keeps pitch and roll neutral; `quick`
-        answers faster than is needed to fly a speed.
-        """
+    def step(self, setpoint: VelocitySetpoint, vehicle: VehicleState, now_ns: int) -> Sticks:
+        """Return the sticks for a setpoint at `now_ns`."""
         above_m = height_above_ground_m(vehicle, now_ns)
-        dt_s = min(0.1, max(0.001, (now_ns - self._last_ns) / S)) if self._last_ns else 0.02
+        dt_s = min(MAX_STEP_S, max(MIN_STEP_S, (now_ns - self._last_ns) / S)) if self._last_ns else FIRST_STEP_S
         self._last_ns = now_ns
-        push = None if coast else self._push(now_ns, dt_s, v_ned_m_s, vehicle, above_m, quick)
-        self._feel(push or (0.0, 0.0), dt_s)
-        roll_us, pitch_us = self._lean_sticks(push, vehicle.yaw_rad)
-        climb = -v_ned_m_s[2] if height_m is None else self._climb_m_s(height_m - above_m)
+        acceleration = None if setpoint.coast else self._acceleration(setpoint, vehicle, above_m, now_ns, dt_s)
+        self._update_modelled_lean(acceleration or (0.0, 0.0), dt_s)
+        roll_us, pitch_us = self._lean_sticks(acceleration, vehicle.yaw_rad)
+        height_m, yaw_rad = setpoint.height_m, setpoint.yaw_rad
+        climb = -setpoint.v_ned_m_s[2] if height_m is None else self._climb_m_s(height_m - above_m)
         rate = 0.0 if yaw_rad is None else self._yaw_rate_rad_s(wrap_rad(yaw_rad - vehicle.yaw_rad))
         expires_ns = now_ns + round(self.tuning.expiry_s * S)
         return Sticks(
             now_ns, expires_ns, roll_us, pitch_us, self.model.throttle.width_us(climb), self.model.yaw_us(rate)
         )
 
-    def steadied(self, vehicle: VehicleState, now_ns: int) -> VehicleState:
-        """Return the state now, its horizontal velocity by Loiter's law on what was commanded, drawn to the measured.
+    def filtered_state(self, vehicle: VehicleState, now_ns: int) -> VehicleState:
+        """Return the state now with a filtered horizontal velocity: Loiter's model, corrected by the measured one.
 
-        Call once before every `step`. The noise of a measured velocity alone takes a line 17 mm off.
+        A complementary filter with time constant `filter_s`; call once before every `step`. The noise of the measured
+        velocity alone moves a followed line by 17 mm.
         """
         above_m = height_above_ground_m(vehicle, now_ns)
-        age_s = max(0.0, min(0.2, (now_ns - vehicle.position_t_ns) / S))
-        dt_s = min(0.1, max(0.0, (now_ns - self._last_ns) / S)) if self._last_ns else 0.0
-        share = 1.0 - math.exp(-dt_s / self.tuning.steady_s)
-        steady = []
-        for axis, felt in enumerate(self._felt):
+        age_s = max(0.0, min(MAX_STATE_AGE_S, (now_ns - vehicle.position_t_ns) / S))
+        dt_s = min(MAX_STEP_S, max(0.0, (now_ns - self._last_ns) / S)) if self._last_ns else 0.0
+        share = 1.0 - math.exp(-dt_s / self.tuning.filter_s)
+        filtered = []
+        for axis, modelled in enumerate(self._modelled_m_s2):
             measured = vehicle.v_ned_m_s[axis]
-            v = self._steady[axis] if self._steady else measured
-            v += dt_s * (felt - self.model.drag_m_s2(v, above_m))
-            ahead = age_s * (felt - self.model.drag_m_s2(measured, above_m))
-            steady.append(v + share * (measured + ahead - v))
-        self._steady = (steady[0], steady[1])
-        return replace(vehicle, v_ned_m_s=(*self._steady, vehicle.v_ned_m_s[2]), position_t_ns=now_ns)
+            v = self._filtered_m_s[axis] if self._filtered_m_s else measured
+            v += dt_s * (modelled - self.model.drag_m_s2(v, above_m))
+            ahead = age_s * (modelled - self.model.drag_m_s2(measured, above_m))
+            filtered.append(v + share * (measured + ahead - v))
+        self._filtered_m_s = (filtered[0], filtered[1])
+        return replace(vehicle, v_ned_m_s=(*self._filtered_m_s, vehicle.v_ned_m_s[2]), position_t_ns=now_ns)
 
-    def _push(
-        self,
-        now_ns: int,
-        dt_s: float,
-        v_ned_m_s: tuple[float, float, float],
-        vehicle: VehicleState,
-        above_m: float,
-        quick: bool,
+    def _acceleration(
+        self, setpoint: VelocitySetpoint, vehicle: VehicleState, above_m: float, now_ns: int, dt_s: float
     ) -> Vector2 | None:
-        """Return the acceleration (north, east) to lean for, drag not counted; None for neutral sticks."""
-        stopping = math.hypot(v_ned_m_s[0], v_ned_m_s[1]) < STANDSTILL_M_S
+        """Return the acceleration (north, east; m/s2) to lean for, drag not included; None for neutral sticks."""
+        v_north, v_east, _ = setpoint.v_ned_m_s
+        stopping = math.hypot(v_north, v_east) < STANDSTILL_M_S
         predicted = self._predicted_m_s(now_ns, vehicle, above_m)
-        if stopping and (self.tuning.stop_lean_rad == 0.0 or math.hypot(*predicted) < 3 * STANDSTILL_M_S):
-            self._forget()
+        if stopping and (self.tuning.stop_lean_rad == 0.0 or math.hypot(*predicted) < ACTIVE_STOP_M_S):
+            self._reset_loops()
             return None
-        wanted = (0.0, 0.0) if stopping else (v_ned_m_s[0], v_ned_m_s[1])
-        most = G_M_S2 * math.tan(min(self.tuning.max_lean_rad, self.model.lean_max_rad))
-        loops = self._quick if quick else self._calm
+        wanted = (0.0, 0.0) if stopping else (v_north, v_east)
+        max_m_s2 = G_M_S2 * math.tan(min(self.tuning.max_lean_rad, self.model.lean_max_rad))
+        loops = self._fast if setpoint.fast_response else self._normal
         errors = [want - have for want, have in zip(wanted, predicted, strict=True)]
         drag = [self.model.drag_m_s2(want, above_m) for want in wanted]
-        room = _room(loops, errors, drag, most)
+        bounds = _axis_bounds(loops, errors, drag, max_m_s2)
         north, east = (
             loop.step(error, dt_s, -bound, bound, ahead)
-            for loop, error, ahead, bound in zip(loops, errors, drag, room, strict=True)
+            for loop, error, ahead, bound in zip(loops, errors, drag, bounds, strict=True)
         )
         brake_lean = self.tuning.stop_lean_rad if stopping else self.tuning.brake_lean_rad
         return _bounded((north, east), predicted, self.tuning.max_lean_rad, brake_lean)
 
     def _predicted_m_s(self, now_ns: int, vehicle: VehicleState, above_m: float) -> Vector2:
-        """Velocity at the time when a lean commanded now takes hold, by Loiter's own law on what was commanded.
+        """Return the velocity at the time when a lean commanded now takes effect, by Loiter's model.
 
-        The attitude would not do: it shows the airframe's drag, not Loiter's.
+        The measured attitude cannot be used: it balances the airframe's drag, not the one that Loiter models.
         """
-        age_s = max(0.0, min(0.2, (now_ns - vehicle.position_t_ns) / S))
+        age_s = max(0.0, min(MAX_STATE_AGE_S, (now_ns - vehicle.position_t_ns) / S))
         ahead_s = age_s + self.tuning.lean_lag_s
         north, east = (
-            v + ahead_s * (felt - self.model.drag_m_s2(v, above_m))
-            for v, felt in zip(vehicle.v_ned_m_s[:2], self._felt, strict=True)
+            v + ahead_s * (modelled - self.model.drag_m_s2(v, above_m))
+            for v, modelled in zip(vehicle.v_ned_m_s[:2], self._modelled_m_s2, strict=True)
         )
         return north, east
 
-    def _feel(self, push: Vector2, dt_s: float) -> None:
-        """Follow what was commanded through the lag of the lean."""
+    def _update_modelled_lean(self, acceleration: Vector2, dt_s: float) -> None:
+        """Pass the commanded acceleration through a first-order model of the lean."""
         share = 1.0 - math.exp(-dt_s / self.tuning.lean_lag_s)
-        self._felt = (
-            self._felt[0] + share * (push[0] - self._felt[0]),
-            self._felt[1] + share * (push[1] - self._felt[1]),
+        self._modelled_m_s2 = (
+            self._modelled_m_s2[0] + share * (acceleration[0] - self._modelled_m_s2[0]),
+            self._modelled_m_s2[1] + share * (acceleration[1] - self._modelled_m_s2[1]),
         )
 
-    def _lean_sticks(self, push: Vector2 | None, yaw_rad: float) -> tuple[int, int]:
-        if push is None:
+    def _lean_sticks(self, acceleration: Vector2 | None, yaw_rad: float) -> tuple[int, int]:
+        if acceleration is None:
             return self.model.roll.trim_us, self.model.pitch.trim_us
+        north, east = acceleration
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-        return self.model.sticks_for_acceleration(cos * push[0] + sin * push[1], cos * push[1] - sin * push[0])
+        return self.model.sticks_for_acceleration(cos * north + sin * east, cos * east - sin * north)
 
     def _climb_m_s(self, error_m: float) -> float:
         tuning = self.tuning
@@ -200,21 +230,21 @@ class VelocityController:
         return max(-tuning.yaw_rate_max_rad_s, min(tuning.yaw_rate_max_rad_s, tuning.yaw_gain_1_s * error_rad))
 
 
-def _room(loops: tuple[Pid, Pid], errors: list[float], drag: list[float], most: float) -> Vector2:
-    """Bounds of both axes that shorten an acceleration beyond `most` without turning it.
+def _axis_bounds(loops: tuple[Pid, Pid], errors: list[float], drag: list[float], max_m_s2: float) -> Vector2:
+    """Return bounds of both axes that shorten an acceleration beyond `max_m_s2` without changing its direction.
 
-    Each axis bounded for itself would fly 21 degrees off north at 45 degrees until the faster axis is there.
+    With each axis bounded by `max_m_s2` itself, a velocity 21 degrees off north would first be approached at 45 degrees.
     """
     north, east = (
         abs(ahead + loop.gains.kp * error + loop.integral)
         for loop, error, ahead in zip(loops, errors, drag, strict=True)
     )
     size = math.hypot(north, east)
-    return (most, most) if size <= most else (north * most / size, east * most / size)
+    return (max_m_s2, max_m_s2) if size <= max_m_s2 else (north * max_m_s2 / size, east * max_m_s2 / size)
 
 
 def _bounded(acceleration: Vector2, velocity: Vector2, max_lean_rad: float, brake_lean_rad: float) -> Vector2:
-    """Shorten an acceleration to the largest lean, and its part against the motion to the brake's lean."""
+    """Shorten an acceleration (m/s2) to the largest lean, and its part against the motion to the brake's lean."""
     north, east = acceleration
     speed = math.hypot(*velocity)
     if speed > STANDSTILL_M_S:
@@ -222,6 +252,6 @@ def _bounded(acceleration: Vector2, velocity: Vector2, max_lean_rad: float, brak
         excess = min(0.0, along + G_M_S2 * math.tan(brake_lean_rad))
         north, east = north - excess * velocity[0] / speed, east - excess * velocity[1] / speed
     size = math.hypot(north, east)
-    most = G_M_S2 * math.tan(max_lean_rad)
-    scale = most / size if size > most else 1.0
+    max_m_s2 = G_M_S2 * math.tan(max_lean_rad)
+    scale = max_m_s2 / size if size > max_m_s2 else 1.0
     return north * scale, east * scale

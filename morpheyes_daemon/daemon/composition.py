@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 from morpheyes_daemon.bus import EventLog, StickPulse, Topics
 from morpheyes_daemon.clock import Clock, S
-from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig, VehicleConfig
-from morpheyes_daemon.control.baseline import BaselineModel, FixedBaseline
+from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
+from morpheyes_daemon.control.baseline import BaselineModel, baseline_model
 from morpheyes_daemon.control.governor import Governor
 from morpheyes_daemon.control.limits import governor_limits, velocity_tuning
 from morpheyes_daemon.control.loiter import LoiterModel
@@ -81,7 +81,8 @@ class Daemon:
             Governor(governor_limits(config)), lambda model: velocity_tuning(config, model)
         )
         self._poses = PoseHistory()
-        model = BaselineModel(config.servo.motion) if not isinstance(config.servo, NoServoConfig) else None
+        where = baseline_model(config)
+        model = where if isinstance(where, BaselineModel) else None
         alarms = Alarms(self.monitor, model)
         self.supervisor.add(
             *build_tasks(
@@ -103,7 +104,7 @@ class Daemon:
                     controller=self._controller,
                     poses=self._poses,
                     baseline=model,
-                    where=model or FixedBaseline(config.baseline_range_m[0]),
+                    where=where,
                     alarms=alarms,
                     on_health=self._on_health,
                     sticks_sent=StickPulse(),

@@ -18,6 +18,7 @@ from morpheyes_daemon.messages.reasons import Reason
 
 Image = NDArray[np.uint8]
 FloatMap = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 Vector = NDArray[np.float64]
 
 
@@ -223,11 +224,11 @@ class Intent(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A path to keep to between two commands: through `p_ned_m` at `t_ns`, a point that moves with `v_ned_m_s` and
-    `a_ned_m_s2`; the command's velocity goes along it, or, when it is zero, the point itself is held.
+    """A straight path to follow between two commands: through a point that is at `p_ned_m` at `t_ns` and moves with
+    `v_ned_m_s` and `a_ned_m_s2`, along the command's velocity; when that is zero, the point itself is held.
 
-    `gain_1_s` turns what is missing to the line into speed, at most `most_m_s` of it; `integral_1_s2` adds what wind
-    and drag keep missing.
+    `gain_1_s` times the error is the correction, at most `max_m_s`; `integral_1_s2` removes the steady error of wind
+    and drag. `fast_response` has the velocity loop use its fast gain on a filtered velocity.
     """
 
     t_ns: int
@@ -236,7 +237,8 @@ class Line:
     a_ned_m_s2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gain_1_s: float = 1.5
     integral_1_s2: float = 0.0
-    most_m_s: float = 1.0
+    max_m_s: float = 1.0
+    fast_response: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,13 @@ class Action(StrEnum):
 Widths = tuple[int, int, int, int]
 """Roll, pitch, throttle, yaw in microseconds."""
 
+NARROWEST_US, WIDEST_US = 800, 2200
+"""Range of RCn_MIN and RCn_MAX, and of every valid pulse width.
+
+0 means an absent channel or a release, 65534 and 65535 mean other things than a width (MAVLink RC_CHANNELS,
+RC_CHANNELS_OVERRIDE). Source: data sheet, ArduPilot parameter list, RCn_MIN and RCn_MAX.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class GateOutput:

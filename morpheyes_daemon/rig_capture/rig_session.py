@@ -9,8 +9,8 @@ from types import TracebackType
 from typing import Self
 
 from morpheyes_daemon.clock import MS, Clock
-from morpheyes_daemon.config.vehicle import NoServoConfig, VehicleConfig
-from morpheyes_daemon.control.baseline import BaselineModel, FixedBaseline
+from morpheyes_daemon.config.vehicle import VehicleConfig
+from morpheyes_daemon.control.baseline import baseline_model
 from morpheyes_daemon.control.baseline_planner import OVERSHOOT_M
 from morpheyes_daemon.devices.camera import Camera, build_camera
 from morpheyes_daemon.devices.family import DeviceContext
@@ -25,7 +25,7 @@ class RigSession:
     def __init__(self, camera: Camera, servo: Servo, config: VehicleConfig, clock: Clock) -> None:
         self._camera, self._servo, self._clock = camera, servo, clock
         self._range_m = config.baseline_range_m
-        self._model = _baseline_model(config)
+        self._model = baseline_model(config)
 
     @classmethod
     def of(cls, config: VehicleConfig, clock: Clock, opener: LinkOpener) -> Self:
@@ -57,16 +57,10 @@ class RigSession:
         above_m = min(nominal_m + OVERSHOOT_M, self._range_m[1])
         for target_m in (above_m, nominal_m):
             await self._servo.move(target_m)
-            self._model.command(target_m, self._clock.now_ns())
+            self._model.on_acknowledged(target_m, self._clock.now_ns())
             while self._model.at(self._clock.now_ns()).moving:
                 await self._clock.sleep_until_ns(self._clock.now_ns() + 20 * MS)
 
     async def pair(self) -> RawPair:
         """Wait for the next raw pair."""
         return await self._camera.read()
-
-
-def _baseline_model(config: VehicleConfig) -> BaselineModel | FixedBaseline:
-    if isinstance(config.servo, NoServoConfig):
-        return FixedBaseline(config.baseline_range_m[0])
-    return BaselineModel(config.servo.motion)

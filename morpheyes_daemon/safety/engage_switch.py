@@ -8,9 +8,7 @@ has no such channel yet, a message that was overtaken on the way and a worn cont
 from __future__ import annotations
 
 from morpheyes_daemon.clock import MS, S
-
-NARROWEST_US, WIDEST_US = 800, 2200
-"""A pulse outside is no pulse: 0 and 65535 mean that the channel is absent (MAVLink RC_CHANNELS)."""
+from morpheyes_daemon.messages.safety import NARROWEST_US, WIDEST_US
 
 STEADY_NS = 200 * MS
 """Either position must last this long; longer than messages of one link overtake each other."""

@@ -15,7 +15,7 @@ from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.errors import DeviceError
 from morpheyes_daemon.messages.core import Sticks
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.messages.safety import Action, GateOutput, State, Widths
+from morpheyes_daemon.messages.safety import NARROWEST_US, WIDEST_US, Action, GateOutput, State, Widths
 from morpheyes_daemon.safety.leases import LEASE_REASONS, LONGEST_LEASE_NS, Lease
 from morpheyes_daemon.safety.states import EFFECTS
 
@@ -28,9 +28,6 @@ RELEASE_REPEATS = 20
 
 LATE_NS = 100 * MS
 """After a pause as long as this the sticks start from neutral again."""
-
-NARROWEST_US, WIDEST_US = 800, 2200
-"""What RCn_MIN and RCn_MAX may be; 0, 65534 and 65535 mean other things than a width."""
 
 
 @dataclass(frozen=True, slots=True)

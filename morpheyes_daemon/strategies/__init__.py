@@ -1,1 +1,1 @@
-"""Missions as strategies: what to make of an image, and where to fly."""
+"""Missions as strategies: perception of a frame, and the decision where to fly."""

@@ -1,7 +1,7 @@
-"""What a mission strategy is: how to look (`perceive`) and where to fly (`decide`).
+"""The interface of a mission strategy: perception (`perceive`) and decision (`decide`).
 
-`perceive` runs in the vision worker and sees the images; `decide` runs in the event loop on what `perceive` found.
-The two run in different processes: state kept on `self` by one is not seen by the other. Neither may read a clock
+`perceive` runs in the vision worker and gets the images; `decide` runs in the event loop and gets the percept.
+The two run in different processes: state kept on `self` by one is not visible to the other. Neither may read a clock
 or open anything; both must be deterministic.
 """
 
@@ -25,9 +25,10 @@ class StrategyParameters(Section):
 
 @dataclass(frozen=True, slots=True)
 class Craft:
-    """What a strategy may know of the vehicle it flies on.
+    """Properties of the vehicle that a strategy may use.
 
-    `T_frd_rig` is where the stereo bar sits on the body. `baseline_range_m` is what the rig can take.
+    `T_frd_rig` (4, 4) is the pose of the stereo bar on the body, metres. `baseline_range_m` is the smallest and largest
+    baseline of the rig.
     """
 
     footprint: Footprint
@@ -40,7 +41,7 @@ class Craft:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """One frame as the strategy sees it in the vision worker.
+    """One rectified stereo frame, as a strategy gets it in the vision worker.
 
     `left` is the rectified left image (H, W) uint8 grey, `right` its partner; `vehicle` is the state at exposure.
     """
@@ -53,7 +54,7 @@ class View:
 
     @property
     def T_ned_rect(self) -> Vector:
-        """Pose (4, 4) of the rectified left camera at exposure."""
+        """Pose (4, 4) of the rectified left camera in ned at exposure, metres."""
         T = np.eye(4)
         T[:3, :3] = R_from_rpy(self.vehicle.roll_rad, self.vehicle.pitch_rad, self.vehicle.yaw_rad)
         T[:3, 3] = self.vehicle.p_ned_m
@@ -70,13 +71,13 @@ class Strategy(ABC):
         self.craft = craft
 
     def perceive(self, view: View) -> Any:
-        """Return what `decide` needs of one frame; picklable and small. Called in the vision worker."""
+        """Return the percept of one frame for `decide`; picklable and small. Called in the vision worker."""
         return None
 
     def track(self, percept: Any) -> Track | None:
-        """Return the moving object that a percept tells of, for topic, log and autopilot; None when there is none."""
+        """Return the track of a percept, for topic, log and autopilot; None when there is none."""
         return None
 
     @abstractmethod
     def decide(self, observation: Observation) -> MissionCommand:
-        """Return what the vehicle should do until the next frame. Called in the event loop."""
+        """Return the mission command until the next frame. Called in the event loop."""

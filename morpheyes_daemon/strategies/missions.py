@@ -11,17 +11,17 @@ from morpheyes_daemon.errors import ConfigError
 
 
 def mission_names() -> list[str]:
-    """Return the missions that the package ships."""
+    """Return the names of the missions that the package ships."""
     return sorted(path.stem for path in shipped("missions").glob("*.yaml"))
 
 
 def find_mission(mission: str) -> Path:
-    """Return the file of a mission given by path or by shipped name; raises ConfigError naming those there are."""
+    """Return the file of a mission given by path or by shipped name; raises ConfigError naming all missions."""
     path = Path(mission)
     if path.suffix in (".yaml", ".yml"):
         if path.is_file():
             return path
-        raise ConfigError(f"{path}: there is no such mission file.")
+        raise ConfigError(f"{path}: there is no such mission file; check the path.")
     named = shipped("missions") / f"{mission}.yaml"
     if named.is_file():
         return named

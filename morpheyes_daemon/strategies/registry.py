@@ -22,12 +22,12 @@ BUILT_IN = {
 
 
 def strategy_names() -> list[str]:
-    """Return every strategy that can be named in a mission file."""
+    """Return the names of all strategies that a mission file may use."""
     return sorted({*BUILT_IN, *(point.name for point in entry_points(group="morpheyes.strategies"))})
 
 
 def find_strategy(name: str) -> type[Strategy]:
-    """Return the class of a strategy; raises ConfigError naming those there are."""
+    """Return the class of a strategy; raises ConfigError naming the strategies that exist."""
     if name in BUILT_IN:
         module, _, attribute = BUILT_IN[name].partition(":")
         found = getattr(import_module(module), attribute)
@@ -40,7 +40,10 @@ def find_strategy(name: str) -> type[Strategy]:
         except (ImportError, AttributeError) as error:
             raise ConfigError(f"the strategy {name!r} cannot be loaded: {error}.") from error
     if not (isinstance(found, type) and issubclass(found, Strategy)):
-        raise ConfigError(f"the strategy {name!r} is not a subclass of morpheyes_daemon.strategies.base.Strategy.")
+        raise ConfigError(
+            f"the strategy {name!r} is not a subclass of morpheyes_daemon.strategies.base.Strategy;"
+            " correct its entry point."
+        )
     return found
 
 
@@ -56,5 +59,5 @@ def check_mission(path: Path, mission: MissionFile) -> MissionFile:
 
 
 def _wrapped(parameters: type[StrategyParameters]) -> type[BaseModel]:
-    """A model with one key `parameters`, so that errors name the lines of the mission file."""
+    """Return a model with one key `parameters`, so that errors name the lines of the mission file."""
     return create_model("Parameters", parameters=(parameters, ...))

@@ -49,4 +49,4 @@ class Alarms:
         lost = event.reason in ALARMS
         self._monitor.set_missing(event.reason if lost else None, "servo")
         if lost and self._baseline is not None:
-            self._baseline.doubt(self._baseline.at(event.t_ns).target_m, event.t_ns)
+            self._baseline.on_unconfirmed(self._baseline.at(event.t_ns).target_m, event.t_ns)

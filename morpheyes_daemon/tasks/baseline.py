@@ -56,6 +56,6 @@ class BaselineTask:
 
     async def _move(self, target_m: float) -> None:
         """Between sending a target and its acknowledgement the cameras may have begun to move, or not."""
-        self.model.send(target_m, self.clock.now_ns())
+        self.model.on_sent(target_m, self.clock.now_ns())
         await self.servo.move(target_m)
-        self.model.command(target_m, self.clock.now_ns())
+        self.model.on_acknowledged(target_m, self.clock.now_ns())

@@ -21,6 +21,7 @@ os.environ["MAVLINK20"] = "1"  # read by pymavlink on import; without it some to
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from morpheyes_daemon.errors import ConfigError
+from morpheyes_daemon.messages.safety import NARROWEST_US, WIDEST_US
 
 __all__ = [
     "LEAVE",
@@ -42,7 +43,6 @@ Message = Any
 
 LEAVE = 65535
 """RC_CHANNELS_OVERRIDE: the autopilot keeps what it has on this channel (1 to 8)."""
-NARROWEST_US, WIDEST_US = 800, 2200
 SIGNING_EPOCH_S = 1_420_070_400
 """Signature stamps count 10 us since 2015-01-01 UTC."""
 

@@ -10,11 +10,11 @@ import pytest
 
 from morpheyes_daemon.clock import MS, S, Ticker, run_virtual
 from morpheyes_daemon.control.loiter import LoiterModel
-from morpheyes_daemon.control.velocity import VelocityController
+from morpheyes_daemon.control.velocity import VelocityController, VelocitySetpoint
+from morpheyes_daemon.devices.autopilot.stick_output import ChannelMap
 from morpheyes_daemon.devices.link import MemoryLink
 from morpheyes_daemon.simulation.autopilot.parameters import FLOW_SETUP, RECOMMENDED
 from morpheyes_daemon.simulation.crew.scripted import GroundCrew
-from morpheyes_daemon.wire.mavlink import ChannelOverride
 from tests.support.connection_bench import ConnectionBench
 
 HEIGHT_M = 2.4
@@ -30,7 +30,9 @@ class Flight:
         self.bench = bench
         self.track: list[tuple[float, float]] = []
         self.output = bench.connection.claim_stick_output()
-        self.model = LoiterModel.from_parameters(bench.connection.parameters.values)
+        parameters = bench.connection.parameters.values
+        self.model = LoiterModel.from_parameters(parameters)
+        self.channels = ChannelMap.from_parameters(parameters)
         self.controller = VelocityController(self.model)
 
     async def fly(self, seconds: float, north_m_s: float) -> list[float]:
@@ -41,8 +43,8 @@ class Flight:
             await ticker.wait()
             now_ns = clock.now_ns()
             state = self.bench.vehicle
-            s = self.controller.step(now_ns, (north_m_s, 0.0, 0.0), 0.0, HEIGHT_M, state)
-            self.output(ChannelOverride(self.model.channels((s.roll_us, s.pitch_us, s.throttle_us, s.yaw_us))))
+            s = self.controller.step(VelocitySetpoint((north_m_s, 0.0, 0.0), 0.0, HEIGHT_M), state, now_ns)
+            self.output(self.channels.override((s.roll_us, s.pitch_us, s.throttle_us, s.yaw_us)))
             truth = self.bench.twin.truth_at(now_ns - 20 * MS)
             speeds.append(truth.v_ned_m_s[0])
             assert abs(truth.v_ned_m_s[1]) < 0.35

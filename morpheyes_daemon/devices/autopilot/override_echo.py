@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections import deque
 
 from morpheyes_daemon.clock import S
+from morpheyes_daemon.messages.safety import Widths
 from morpheyes_daemon.wire.mavlink import ChannelOverride
 
 ECHO_NS = 1 * S
 STEADY_NS = S // 2
 """Overrides must have come without a pause as long as this, or it is no stream that could be echoed."""
-
-Widths = tuple[int, int, int, int]
 
 
 class OverrideEcho:

@@ -1,4 +1,4 @@
-"""What the gap mission takes from one frame: the wall ahead, its openings, and how far lengths can be believed."""
+"""Perception of the gap mission: the wall ahead, its openings, and how certain lengths are, from one frame."""
 
 from __future__ import annotations
 
@@ -9,25 +9,42 @@ from dataclasses import dataclass
 import numpy as np
 
 from morpheyes_daemon.strategies.base import View
-from morpheyes_daemon.strategies.gap.openings import Opening, Place, Silhouette, find_openings, passage
-from morpheyes_daemon.strategies.gap.wall_segmentation import split
+from morpheyes_daemon.strategies.gap.openings import (
+    CrossingPoint,
+    Opening,
+    Silhouette,
+    crossing_frame,
+    find_openings,
+)
+from morpheyes_daemon.strategies.gap.wall_segmentation import segment_wall
 from morpheyes_daemon.transforms import Array
 
-SAME_M = 0.5
-"""An opening seen this near to where the tracked one should be is the same."""
+SAME_OPENING_M = 0.5
+"""Distance from the tracked position up to which an opening is the tracked one.
+
+Chosen: an opening moves 0.1 m between frames; larger confuses neighbouring openings."""
 
 ALONG_SHARE = 0.4
-"""Of what counts across, along the way: range is seen worse."""
+"""Weight of a distance along the wall's normal, relative to one across it. Unit: none.
 
-AS_GOOD_M, BETTER_M = 0.005, 0.02
-"""A place with so little less room is as good, an opening with so much more is better."""
+Chosen: range is measured with about that much less certainty than direction at the stand-off."""
+
+EQUAL_M, LARGER_M = 0.005, 0.02
+"""Clearance by which a point may be worse and still count as equal, and by which an opening is larger.
+
+Chosen: half a pixel and two pixels at the stand-off; smaller alternates between openings."""
+
+MIN_RANGE_M = 0.1
+"""Smallest range by which a direction is divided.
+
+Chosen: only avoids the division by zero at the wall."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GapPercept:
     """What one frame shows of wall and openings. `range_m` to the wall along its normal and the normal's heading
     `yaw_rad` are NaN without a wall; `separation` is Ashman's D of the two depth clusters, `bimodal` whether there
-    are two. `scale_sigma` is the relative doubt of every length, from the baseline's. `origin_ned_m` is the camera.
+    are two. `scale_sigma` is the relative sigma of every length, from the baseline's. `origin_ned_m` is the camera.
     """
 
     t_ns: int
@@ -43,18 +60,18 @@ class GapPercept:
 
 
 def gap_percept(view: View, silhouette: Silhouette) -> GapPercept:
-    """Return what a frame shows of a wall with openings; without a wall there are none."""
+    """Return the wall and its openings in a view; without a wall there are none."""
     depth, T_ned_rect = view.depth, view.T_ned_rect
-    found = split(depth)
-    way = passage(found.plane, depth.pinhole, T_ned_rect) if found else None
-    openings = find_openings(depth, found, way, silhouette) if found and way else ()
+    found = segment_wall(depth)
+    frame = crossing_frame(found.plane, depth.pinhole, T_ned_rect) if found else None
+    openings = find_openings(depth, found, frame, silhouette) if found and frame else ()
     north, east, down = (float(x) for x in T_ned_rect[:3, 3])
     return GapPercept(
         t_ns=depth.t_ns,
         bimodal=found.bimodal if found else False,
         separation=found.separation if found else 0.0,
-        range_m=way.range_m if way else math.nan,
-        yaw_rad=way.yaw_rad if way else math.nan,
+        range_m=frame.range_m if frame else math.nan,
+        yaw_rad=frame.yaw_rad if frame else math.nan,
         near_limit_m=depth.near_limit_m,
         scale_sigma=depth.baseline_sigma_m / depth.baseline_m,
         origin_ned_m=(north, east, down),
@@ -63,46 +80,49 @@ def gap_percept(view: View, silhouette: Silhouette) -> GapPercept:
     )
 
 
-def tracked_place(
-    openings: Sequence[Opening], at_ned_m: Array, ahead: Array, range_known: bool
-) -> tuple[Opening, Place] | None:
-    """Return which of some openings, and which place in it, is the one that should be at `at_ned_m`, None for none.
+def match_tracked_opening(
+    openings: Sequence[Opening], expected_ned_m: Array, ahead: Array, range_known: bool
+) -> tuple[Opening, CrossingPoint] | None:
+    """Return the opening, and the crossing point in it, nearest to `expected_ned_m` (3,), metres; None for none.
 
-    `ahead` (3,) is the way through the wall; along it nothing counts unless the range is known. The paper's x_s is a
-    place like others where it is as good as the roomiest.
+    `ahead` (3,) is the unit normal through the wall; distances along it are ignored unless the range is known. The
+    paper's x_s is one of the points where its clearance equals the largest.
     """
 
-    def off(place: Place) -> float:
-        apart = np.array(place.p_ned_m) - at_ned_m
+    def distance_m(point: CrossingPoint) -> float:
+        apart = np.array(point.p_ned_m) - expected_ned_m
         along_m = float(apart @ ahead)
         across_m = float(np.linalg.norm(apart - along_m * ahead))
         return math.hypot(across_m, ALONG_SHARE * along_m if range_known else 0.0)
 
-    near = [(off(place), opening, place) for opening in openings for place in _places(opening)]
-    off_m, opening, place = min(near, key=lambda row: row[0])
-    return (opening, place) if off_m < SAME_M else None
+    near = [(distance_m(point), opening, point) for opening in openings for point in _points(opening)]
+    nearest_m, opening, point = min(near, key=lambda row: row[0])
+    return (opening, point) if nearest_m < SAME_OPENING_M else None
 
 
-def at_range_of(known_ned_m: Array, p_ned_m: Array, percept: GapPercept, ahead: Array) -> Array:
-    """Return a place (3,) in the direction in which it was seen, as far along `ahead` (3,) as a known one."""
+def at_known_range(known_ned_m: Array, p_ned_m: Array, percept: GapPercept, ahead: Array) -> Array:
+    """Return a place (3,), ned metres, in the direction of `p_ned_m` (3,), at the range of `known_ned_m` (3,).
+
+    The range is along the unit normal `ahead` (3,).
+    """
     origin = np.array(percept.origin_ned_m)
     known_m, seen_m = float((known_ned_m - origin) @ ahead), float((p_ned_m - origin) @ ahead)
-    return np.asarray(origin + (p_ned_m - origin) * known_m / max(0.1, seen_m))
+    return np.asarray(origin + (p_ned_m - origin) * known_m / max(MIN_RANGE_M, seen_m))
 
 
-class PassedOver:
-    """Whether the opening that is followed is the wrong one: from afar the roomiest may not be told."""
+class LargerOpeningVote:
+    """Confirms over consecutive frames that another opening is larger: from afar the largest may not be apparent."""
 
     def __init__(self, frames: int) -> None:
-        self._frames, self._seen = frames, 0
+        self._frames, self._count = frames, 0
 
-    def more_room(self, others: Sequence[Opening], followed: Place) -> bool:
-        """Tell whether one of the others has had clearly more room in `frames` frames in a row, up to this one."""
-        roomiest_m = max((other.places[0].clearance_m for other in others if not other.cut), default=-math.inf)
-        self._seen = self._seen + 1 if roomiest_m > followed.clearance_m + BETTER_M else 0
-        return self._seen >= self._frames
+    def update(self, others: Sequence[Opening], followed: CrossingPoint) -> bool:
+        """Return whether one of the others had LARGER_M more clearance in `frames` consecutive frames."""
+        largest_m = max((other.crossing_points[0].clearance_m for other in others if not other.cut), default=-math.inf)
+        self._count = self._count + 1 if largest_m > followed.clearance_m + LARGER_M else 0
+        return self._count >= self._frames
 
 
-def _places(opening: Opening) -> tuple[Place, ...]:
-    as_good = opening.safest.clearance_m > opening.places[0].clearance_m - AS_GOOD_M
-    return (*opening.places, opening.safest) if as_good else opening.places
+def _points(opening: Opening) -> tuple[CrossingPoint, ...]:
+    equal = opening.safe_point.clearance_m > opening.crossing_points[0].clearance_m - EQUAL_M
+    return (*opening.crossing_points, opening.safe_point) if equal else opening.crossing_points

@@ -1,36 +1,37 @@
 """Gap flight: through an opening of unknown shape and place, standing or moving (paper, section V-B).
 
-Looks for the wall's openings, stands off before the one that fits best, sets image and height on its safest point,
-shrinks the baseline ahead of time, watches whether the vehicle really fits, and then flies through along the wall's
-normal at a set speed. Until it is committed it never flies faster than it can stop in before the wall; once an
-opening has been confirmed over several frames, what is free reaches through it as far as it is seen to. The last
-stretch, where the edges have left the view, is flown on the opening's track.
+Searches the wall's openings, flies to the stand-off before the one that fits best, aligns with its crossing point,
+shrinks the baseline, measures whether the vehicle really fits, and then flies through along the wall's normal at a set
+speed. Before the run it never flies faster than it can stop before the wall; on the run free space reaches through the
+opening as far as it is seen. The last part, where the edges have left the view, is flown on the opening's tracker.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
+from dataclasses import replace
 from enum import StrEnum
 
 import numpy as np
 
 from morpheyes_daemon.clock import S
-from morpheyes_daemon.control.baseline import baseline_for
+from morpheyes_daemon.control.baseline import baseline_law
 from morpheyes_daemon.messages.core import Intent, Line, MissionCommand
 from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Strategy, View
+from morpheyes_daemon.strategies.command import CommandBuilder, Decision
 from morpheyes_daemon.strategies.gap.crossing import Crossing
-from morpheyes_daemon.strategies.gap.opening_tracker import Motion, PointTrack
-from morpheyes_daemon.strategies.gap.openings import Opening, Place, Silhouette
+from morpheyes_daemon.strategies.gap.opening_following import CERTAIN_SCALE, OpeningFollower
+from morpheyes_daemon.strategies.gap.opening_tracker import Motion
+from morpheyes_daemon.strategies.gap.openings import Silhouette
 from morpheyes_daemon.strategies.gap.parameters import GapParameters
-from morpheyes_daemon.strategies.gap.perception import GapPercept, PassedOver, at_range_of, gap_percept, tracked_place
+from morpheyes_daemon.strategies.gap.perception import GapPercept, gap_percept
 from morpheyes_daemon.transforms import Array, wrap_rad
 
 
 class Phase(StrEnum):
-    """What the decider is doing. APPROACH: to the stand-off, and measuring there. CLOSE: the eyes draw together."""
+    """State of the mission. APPROACH: to the stand-off, and measuring there. CLOSE: the baseline shrinks."""
 
     APPROACH = "approach"
     CLOSE = "close"
@@ -39,47 +40,49 @@ class Phase(StrEnum):
     OVER = "over"
 
 
-RANGE_SIGMA: Array = np.array([0.010, 0.003, 0.003])
-"""One sigma of where an opening is seen along, across and down, per metre of range: a pixel."""
+STAND_OFF_TOLERANCE_M = 0.35
+"""Distance from the stand-off, along the normal, within which the run may begin.
 
-ATTITUDE_LATE_S = 0.03
-"""An attitude's stamp may be late by this, which counts while the vehicle nods; before a wall it hardly turns."""
+Chosen: does not change the run; smaller waits for the position to settle."""
 
-YAW_SIGMA: Array = np.full(3, 0.02)
-"""One sigma of a wall's heading, radians."""
+YAW_TOLERANCE_RAD = math.radians(3.0)
+"""Yaw error up to which the run may begin.
 
-YAW_WALK_RAD_S = 0.002
-"""And how that seems to wander, radians per root second."""
+Chosen: it adds 5 % of the hull's length to the vehicle's width; smaller waits for the yaw's drift."""
 
-SURE_SCALE = 0.02
-"""Lengths are taken from depth only when the baseline is known this well; while the eyes move they are not."""
+MOVING_TOLERANCE = 2.5
+"""Factor on both tolerances before a moving opening. Unit: none.
 
-FORGOTTEN_S = 2.0
-"""Not seen for so long before the run: what is seen then is another opening."""
+Chosen: the waiting point itself moves with each new fit; smaller misses crossings."""
 
-LOST_S = 0.7
-"""Not seen for so long on the run, while there is room to stop: the run is broken off."""
+SETTLED_M, WIDTH_TOLERANCE_M = 0.004, 1e-3
+"""Difference from the smallest baseline, and width above the silhouette's at 3 sigma, with which it may cross.
 
-STAND_M = 0.35
-"""So near to the stand-off it may take its run."""
+Chosen: below the clearance of 40 mm; smaller than the servo's repeatability would never be reached."""
 
-TURNED_RAD = math.radians(3.0)
-SETTLED_M = 0.004
+HOLD_1_S = 0.6
+"""Gain of the line before the wall.
 
-HOLD_1_S, RUN_1_S, RUN_1_S2 = 0.6, 8.0, 0.5
-"""Gains on what is missing to the line and, on the run, on its integral.
+Chosen: gentle, since a vehicle that brakes looks up and loses the opening."""
 
-Gentle before the wall, since a vehicle that brakes looks up."""
+RUN_1_S, RUN_1_S2 = 8.0, 0.5
+"""Gains of the line and of its integral on the run.
 
-MOVES_M = 0.2
-"""A place that wanders across by more within some seconds moves; the autopilot's drift is 0.05 m."""
+Chosen: the last measurement moves the line just before the wall; higher gains swing at the lean's delay."""
 
 NOSE_M = 0.3
-"""From the autopilot to the foremost point, with some room."""
+"""Distance from the autopilot to the vehicle's front, with a margin.
+
+Chosen: half of the hull and propeller; larger stops earlier before the wall."""
+
+STOPPED_M_S = 0.2
+"""Speed below which the vehicle counts as stopped behind the wall.
+
+Chosen: above the noise of the velocity estimate; lower waits longer for the end of the mission."""
 
 
 class Gap(Strategy):
-    """See the module."""
+    """The gap mission; see the module."""
 
     Parameters = GapParameters
     parameters: GapParameters
@@ -87,22 +90,14 @@ class Gap(Strategy):
     def __init__(self, parameters: GapParameters, craft: Craft) -> None:
         super().__init__(parameters, craft)
         self._phase = Phase.APPROACH
-        self._track = PointTrack()
-        self._yaw = PointTrack(walk_m_s=YAW_WALK_RAD_S)
-        self._room: list[float] = []
-        self._chosen: Opening | None = None
-        self._beyond_m: deque[float] = deque(maxlen=2)
-        self._passed_over = PassedOver(parameters.confirm_frames)
+        self._opening = OpeningFollower(parameters)
         self._crossing = Crossing(parameters)
-        self._yaw_rad = 0.0
-        self._height_m = math.nan
-        self._settled_ns = 0
-        self._seen_ns = 0
-        self._seq = 0
+        self._commands = CommandBuilder(craft.frame_period_s)
+        self._reset_ns = 0
 
     @property
     def silhouette(self) -> Silhouette:
-        """The vehicle along its way, in crossing attitude at the smallest baseline."""
+        """The vehicle's outline along its path, in crossing attitude at the smallest baseline."""
         footprint, lean = self.craft.footprint, math.radians(self.parameters.lean_deg)
         height_m = (footprint.hull_height_mm * math.cos(lean) + footprint.hull_length_mm * math.sin(lean)) / 1e3
         return Silhouette(footprint.width_m(self.craft.baseline_range_m[0]), height_m)
@@ -114,8 +109,8 @@ class Gap(Strategy):
     def decide(self, observation: Observation) -> MissionCommand:
         """Return line, speed and baseline until the next frame."""
         if not observation.engaged:
-            self._settle(observation)
-        self._take_in(observation.percept, observation)
+            self._reset(observation)
+        self._update_opening(observation.percept, observation)
         match self._phase:
             case Phase.APPROACH | Phase.CLOSE:
                 return self._approach(observation)
@@ -124,276 +119,191 @@ class Gap(Strategy):
             case Phase.BEHIND:
                 return self._stop_behind(observation)
             case Phase.OVER:
-                return self._command(observation, Intent.DONE, Reason.GOAL_REACHED)
+                return self._command(observation, Decision(Intent.DONE, Reason.GOAL_REACHED))
 
-    def _settle(self, observation: Observation) -> None:
-        """Before the mission engages: forget what the climb showed."""
+    def _reset(self, observation: Observation) -> None:
+        """Before the mission engages: forget what was seen so far."""
         self._phase = Phase.APPROACH
-        self._yaw_rad = observation.vehicle.yaw_rad
-        self._track, self._yaw = PointTrack(self._yaw_rad), PointTrack(walk_m_s=YAW_WALK_RAD_S)
-        self._room, self._chosen, self._crossing = [], None, Crossing(self.parameters)
-        self._settled_ns = self._seen_ns = observation.now_ns
+        self._opening.reset(observation.vehicle.yaw_rad, observation.now_ns)
+        self._crossing = Crossing(self.parameters)
+        self._reset_ns = observation.now_ns
 
-    def _take_in(self, percept: GapPercept, observation: Observation) -> None:
-        """Follow the chosen opening, or choose one: the roomiest, and again when another one shows more room."""
+    def _update_opening(self, percept: GapPercept, observation: Observation) -> None:
         if self._phase in (Phase.BEHIND, Phase.OVER):
             return
-        if self._phase is not Phase.RUN and percept.t_ns - self._seen_ns > FORGOTTEN_S * S:
-            self._track, self._room, self._phase = PointTrack(self._yaw_rad), [], Phase.APPROACH
-        usable = [opening for opening in percept.openings if not opening.cut or self._may_be_cut(opening)]
-        sure = percept.scale_sigma < SURE_SCALE
-        if not usable or not (sure or self._track.count):
-            return
-        if self._track.count:
-            found = tracked_place(usable, self._track.at(percept.t_ns).p_m, self._ahead(), sure)
-        else:
-            roomiest = max(usable, key=lambda opening: opening.places[0].clearance_m)
-            found = roomiest, roomiest.places[0]
-        if found is None:
-            return
-        opening, place = found
-        others = [other for other in usable if other is not opening]
-        if self._phase is Phase.APPROACH and sure and self._passed_over.more_room(others, place):
-            self._track, self._room = PointTrack(self._yaw_rad), []
-            return
-        self._chosen = opening
-        self._seen_ns = percept.t_ns
-        self._beyond_m.append(opening.beyond_m)
-        p = np.array(place.p_ned_m)
-        if not sure and self._track.count:  # the direction, at the range known before
-            p = at_range_of(self._track.at(percept.t_ns).p_m, p, percept, self._ahead())
-        _, nods, _ = observation.at_exposure.rates_frd_rad_s
-        sigma = np.hypot(RANGE_SIGMA, ATTITUDE_LATE_S * np.array([0.0, 0.0, nods]))
-        sigma_m = np.hypot(sigma * max(0.5, opening.z_m), self._room_missed_m(place))
-        self._track.see(percept.t_ns, p, sigma_m, opening.z_m)
-        if self._phase is not Phase.RUN:
-            heading = np.array([0.0, wrap_rad(percept.yaw_rad - self._yaw_rad), 0.0])
-            self._yaw.see(percept.t_ns, heading, YAW_SIGMA)
-        measures = self._phase is Phase.APPROACH and opening.z_m < 1.2 * self.parameters.stand_off_m
-        if measures and sure:
-            self._room = [*self._room[-30:], place.clearance_m]
-        if self._phase in (Phase.APPROACH, Phase.CLOSE) and self._track.spread_m(3.0) > MOVES_M:
-            self._track.move()
-            self._yaw.move()
-
-    def _may_be_cut(self, opening: Opening) -> bool:
-        """Of an opening that is followed a part may be out of view, as long as the vehicle fits through what is seen.
-
-        On the run only if it was so before: there the edges leave the view one by one, and the place goes with them.
-        """
-        before = self._phase is not Phase.RUN or (self._chosen is not None and self._chosen.cut)
-        return before and self._track.count > 0 and opening.places[0].clearance_m >= self.parameters.margin_m
-
-    def _room_missed_m(self, place: Place) -> float:
-        """How much less room is seen than was measured: so much of the opening may be missing on one side."""
-        return max(0.0, float(np.median(self._room)) - place.clearance_m) if self._phase is Phase.RUN else 0.0
+        if self._phase is not Phase.RUN and self._opening.is_forgotten(percept.t_ns):
+            self._opening.restart()
+            self._phase = Phase.APPROACH
+        measuring, on_run = self._phase is Phase.APPROACH, self._phase is Phase.RUN
+        self._opening.update(percept, observation, measuring=measuring, on_run=on_run)
 
     def _approach(self, observation: Observation) -> MissionCommand:
-        """Fly to the stand-off, set on the opening, confirm that the vehicle fits; then take the run or refuse."""
-        parameters, vehicle, now_ns = self.parameters, observation.vehicle, observation.now_ns
-        percept: GapPercept = observation.percept
-        if not self._track.count or now_ns - self._seen_ns > FORGOTTEN_S * S:
-            if observation.engaged and now_ns - max(self._settled_ns, self._seen_ns) > parameters.look_s * S:
-                why = "no opening in the wall" if percept.bimodal else "the depth has no two clusters"
-                return self._command(observation, Intent.REFUSE, Reason.MISSION_REFUSED, text=why)
-            return self._nearer(observation)
-        ahead, opening = self._ahead(), self._awaited(now_ns)
-        range_m = float((opening.p_m - np.array(vehicle.p_ned_m)) @ ahead)
-        start = opening.p_m - parameters.stand_off_m * ahead
-        if observation.engaged and self._stands(observation, start, ahead):
-            if len(self._room) >= 2 * parameters.confirm_frames and not self._fits():
+        """Fly to the stand-off, align with the opening, confirm that the vehicle fits; then begin the run or refuse."""
+        now_ns, followed = observation.now_ns, self._opening
+        if not followed.track.count or followed.is_forgotten(now_ns):
+            return self._without_opening(observation)
+        ahead, opening = followed.ahead(), self._awaited(now_ns)
+        range_m = float((opening.p_m - np.array(observation.vehicle.p_ned_m)) @ ahead)
+        start = opening.p_m - self.parameters.stand_off_m * ahead
+        if observation.engaged and self._is_at_stand_off(observation, start):
+            if followed.is_measured() and not followed.fits():
                 return self._refuse(observation)
-            if self._phase is Phase.APPROACH and len(self._room) >= 2 * parameters.confirm_frames:
+            if self._phase is Phase.APPROACH and followed.is_measured():
                 self._phase = Phase.CLOSE
-            elif self._phase is Phase.CLOSE and self._closed(observation) and self._may_run(observation):
+            elif self._phase is Phase.CLOSE and self._is_narrow(observation) and self._may_run(observation):
                 self._phase = Phase.RUN
                 self._crossing.begin(now_ns)
                 return self._run(observation)
-        return self._hold(observation, opening, start, ahead, range_m)
+        return self._hold(observation, replace(opening, p_m=start), range_m)
 
-    def _nearer(self, observation: Observation) -> MissionCommand:
-        """Go on to the stand-off before a wall in which no opening is seen yet: from there a small one is."""
+    def _without_opening(self, observation: Observation) -> MissionCommand:
+        """Go on to the stand-off of a wall without a visible opening, from where small ones are; refuse after a time."""
         percept: GapPercept = observation.percept
-        if not (observation.engaged and math.isfinite(percept.range_m) and percept.scale_sigma < SURE_SCALE):
-            return self._command(observation, Intent.STOP, Reason.NO_FREE_PATH, z_m=percept.range_m)
-        here, ahead = np.array(observation.vehicle.p_ned_m), self._ahead()
-        place = here + max(0.0, percept.range_m - self.parameters.stand_off_m) * ahead
-        return self._hold(observation, Motion(place, np.zeros(3), np.zeros(3), 0.0), place, ahead, percept.range_m)
+        last_ns = max(self._reset_ns, self._opening.seen_ns)
+        if observation.engaged and observation.now_ns - last_ns > self.parameters.look_s * S:
+            why = "no opening in the wall" if percept.bimodal else "the depth has no two clusters"
+            return self._command(observation, Decision(Intent.REFUSE, Reason.MISSION_REFUSED, text=why))
+        certain = percept.scale_sigma < CERTAIN_SCALE
+        if not (observation.engaged and math.isfinite(percept.range_m) and certain):
+            return self._command(
+                observation, Decision(Intent.STOP, Reason.NO_FREE_PATH, z_close_m=percept.range_m), percept.range_m
+            )
+        here, ahead = np.array(observation.vehicle.p_ned_m), self._opening.ahead()
+        start = here + max(0.0, percept.range_m - self.parameters.stand_off_m) * ahead
+        return self._hold(observation, Motion(start, np.zeros(3), np.zeros(3), 0.0), percept.range_m)
 
-    def _hold(
-        self, observation: Observation, opening: Motion, start: Array, ahead: Array, range_m: float
-    ) -> MissionCommand:
-        """Go to the stand-off and follow the opening there."""
+    def _hold(self, observation: Observation, start: Motion, range_m: float) -> MissionCommand:
+        """Go to a point that moves as the opening does, at the stand-off, and stay there."""
         line = Line(
-            observation.now_ns, _three(start), _three(opening.v_m_s), _three(opening.a_m_s2), HOLD_1_S,
-            most_m_s=self.parameters.approach_m_s,
+            observation.now_ns, _triple(start.p_m), _triple(start.v_m_s), _triple(start.a_m_s2), HOLD_1_S,
+            max_m_s=self.parameters.approach_m_s,
         )  # fmt: skip
-        return self._command(
-            observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(),
-            clear_m=self._clear_m(observation, range_m), z_m=range_m,
-        )  # fmt: skip
+        clear_m = self._clear_m(observation, range_m)
+        decision = Decision(
+            Intent.FLY, line=line, yaw_rad=self._opening.heading_rad(), clear_m=clear_m, z_close_m=range_m
+        )
+        return self._command(observation, decision, range_m)
 
     def _clear_m(self, observation: Observation, range_m: float) -> float:
-        """How far it may go before the wall: by the track, or by what this frame shows, if that is less."""
+        """Return the free distance before the wall: by the tracker, or by this frame if that is less."""
         percept: GapPercept = observation.percept
         seen_m = range_m
         if math.isfinite(percept.range_m):
-            wall = np.array(percept.origin_ned_m) + percept.range_m * self._ahead()
-            seen_m = float((wall - np.array(observation.vehicle.p_ned_m)) @ self._ahead())
+            wall = np.array(percept.origin_ned_m) + percept.range_m * self._opening.ahead()
+            seen_m = float((wall - np.array(observation.vehicle.p_ned_m)) @ self._opening.ahead())
         return max(0.0, min(range_m, seen_m) - NOSE_M)
 
-    def _stands(self, observation: Observation, start: Array, ahead: Array) -> bool:
-        """Tell whether it stands at the stand-off, set on the opening as it was seen a moment ago."""
-        vehicle = observation.vehicle
+    def _is_at_stand_off(self, observation: Observation, start: Array) -> bool:
+        """Return whether the vehicle is at the stand-off, aligned with an opening that was just measured."""
+        vehicle, ahead = observation.vehicle, self._opening.ahead()
         off = start - np.array(vehicle.p_ned_m)
         along_m = float(off @ ahead)
         across_m = float(np.linalg.norm(off - along_m * ahead))
-        turned = abs(wrap_rad(self._heading_rad() - vehicle.yaw_rad))
-        wide = 2.5 if self._track.moves else 1.0
+        yaw_error_rad = abs(wrap_rad(self._opening.heading_rad() - vehicle.yaw_rad))
+        tolerance = MOVING_TOLERANCE if self._opening.track.is_moving else 1.0
         return (
-            abs(along_m) < STAND_M
-            and across_m < wide * self.parameters.off_line_m
-            and turned < wide * TURNED_RAD
-            and observation.now_ns - self._seen_ns < LOST_S * S
+            abs(along_m) < STAND_OFF_TOLERANCE_M
+            and across_m < tolerance * self.parameters.off_line_m
+            and yaw_error_rad < tolerance * YAW_TOLERANCE_RAD
+            and self._opening.is_fresh(observation.now_ns)
         )
 
-    def _closed(self, observation: Observation) -> bool:
-        """Tell whether the bar, modelled baseline and three sigmas of it, is no wider than it is to be."""
+    def _is_narrow(self, observation: Observation) -> bool:
+        """Return whether the vehicle at the modelled baseline plus three sigmas is as narrow as its silhouette."""
         low_m, summary = self.craft.baseline_range_m[0], observation.summary
         widest_m = summary.baseline_m + 3 * summary.baseline_sigma_m
-        fits = self.craft.footprint.width_m(widest_m) <= self.silhouette.width_m + 1e-3
+        fits = self.craft.footprint.width_m(widest_m) <= self.silhouette.width_m + WIDTH_TOLERANCE_M
         return fits and abs(summary.baseline_m - low_m) < SETTLED_M
 
-    def _fits(self) -> bool:
-        """Tell whether the last frames show that the silhouette fits."""
-        recent = self._room[-2 * self.parameters.confirm_frames :]
-        return float(np.median(recent)) >= self.parameters.margin_m
-
     def _may_run(self, observation: Observation) -> bool:
-        """A standing opening at once; a moving one when it will be slow, and the wall across, on arriving."""
-        now_ns = observation.now_ns
-        return not self._track.moves or self._crossing.due(self._track, self._yaw, self._watched_s(now_ns), now_ns)
+        """Return whether the run may begin: a standing opening at once, a moving one when its crossing is due."""
+        track, yaw, now_ns = self._opening.track, self._opening.yaw, observation.now_ns
+        return not track.is_moving or self._crossing.is_due(track, yaw, self._watched_s(now_ns), now_ns)
 
     def _awaited(self, now_ns: int) -> Motion:
-        """Return the opening as it is waited for: where it is or, when it sways, where it will be crossed."""
-        if self._track.wave is None:
+        """Return the opening for which to wait: where it is or, when it oscillates, where it will be crossed."""
+        track = self._opening.track
+        if track.oscillation is None:
             self._crossing.t_ns = now_ns + self._crossing.run_ns
-            return self._track.at(now_ns)
+            return track.at(now_ns)
         watched_s = self._watched_s(now_ns)
-        self._crossing.plan(self._track, self._yaw, watched_s, now_ns)
-        return Motion(self._crossing.waiting_place(self._track, watched_s), np.zeros(3), np.zeros(3), 0.0)
+        self._crossing.plan(track, self._opening.yaw, watched_s, now_ns)
+        return Motion(self._crossing.waiting_point(track, watched_s), np.zeros(3), np.zeros(3), 0.0)
 
     def _watched_s(self, now_ns: int) -> float:
-        return (now_ns - self._settled_ns) / S
+        return (now_ns - self._reset_ns) / S
 
     def _refuse(self, observation: Observation) -> MissionCommand:
-        need, chosen = self.silhouette, self._chosen
+        need, chosen = self.silhouette, self._opening.chosen
         assert chosen is not None
-        room_m = float(np.median(self._room[-2 * self.parameters.confirm_frames :]))
         text = (
-            f"the opening is {chosen.width_m:.2f} x {chosen.height_m:.2f} m with {room_m * 1e3:.0f} mm of room; "
+            f"the opening is {chosen.width_m:.2f} x {chosen.height_m:.2f} m with "
+            f"{self._opening.clearance_m() * 1e3:.0f} mm of clearance; "
             f"the vehicle needs {need.width_m:.2f} x {need.height_m:.2f} m and {self.parameters.margin_m * 1e3:.0f} mm "
             f"at a baseline of {self.craft.baseline_range_m[0] * 1e3:.0f} mm"
         )
-        return self._command(observation, Intent.REFUSE, Reason.MISSION_REFUSED, text=text)
+        return self._command(observation, Decision(Intent.REFUSE, Reason.MISSION_REFUSED, text=text))
 
     def _run(self, observation: Observation) -> MissionCommand:
-        """Through the opening; broken off while it can still stop before the wall and the opening is lost."""
-        parameters, vehicle, now_ns = self.parameters, observation.vehicle, observation.now_ns
-        ahead = self._ahead()
-        range_m = float((self._track.at(now_ns).p_m - np.array(vehicle.p_ned_m)) @ ahead)
+        """Fly through the opening; abort while the vehicle can still stop before the wall and the opening is lost."""
+        parameters, vehicle, now_ns, followed = self.parameters, observation.vehicle, observation.now_ns, self._opening
+        ahead = followed.ahead()
+        range_m = float((followed.track.at(now_ns).p_m - np.array(vehicle.p_ned_m)) @ ahead)
         if range_m < -parameters.behind_m:
             self._phase = Phase.BEHIND
             return self._stop_behind(observation)
-        lost = now_ns - self._seen_ns > LOST_S * S
-        stoppable = range_m - NOSE_M > observation.reserve_m
-        if stoppable and (lost or not self._fits()):
-            self._phase, self._room = Phase.APPROACH, []
+        can_stop = range_m - NOSE_M > observation.reserve_m
+        if can_stop and (followed.is_lost(now_ns) or not followed.fits()):
+            self._phase, followed.clearances_m = Phase.APPROACH, []
             return self._approach(observation)
-        beyond_m = range_m + self._seen_beyond_m
-        v = parameters.speed_m_s * ahead
-        left_s = self._crossing.left_s(range_m, float(np.array(vehicle.v_ned_m_s) @ ahead), now_ns)
-        opening = self._track.at(now_ns + round(left_s * S))
-        place = opening.p_m - left_s * opening.v_m_s  # a straight way that meets it as it moves then
-        line = Line(now_ns, _three(place), _three(opening.v_m_s), gain_1_s=RUN_1_S, integral_1_s2=RUN_1_S2)
-        return self._command(
-            observation, Intent.FLY, None, line=line, yaw_rad=self._heading_rad(), v_ned_m_s=_three(v),
-            clear_m=max(0.0, beyond_m - NOSE_M), z_m=beyond_m, contour_m=range_m,
+        beyond_m = range_m + followed.beyond_m()
+        left_s = self._crossing.time_to_crossing_s(range_m, float(np.array(vehicle.v_ned_m_s) @ ahead), now_ns)
+        opening = followed.track.at(now_ns + round(left_s * S))
+        point = opening.p_m - left_s * opening.v_m_s  # a straight path that meets the opening as it moves then
+        decision = Decision(
+            Intent.FLY,
+            v_ned_m_s=_triple(parameters.speed_m_s * ahead),
+            yaw_rad=followed.heading_rad(),
+            clear_m=max(0.0, beyond_m - NOSE_M),
+            z_close_m=beyond_m,
+            line=Line(
+                now_ns, _triple(point), _triple(opening.v_m_s),
+                gain_1_s=RUN_1_S, integral_1_s2=RUN_1_S2, fast_response=True,
+            ),
         )  # fmt: skip
+        return self._command(observation, decision, range_m)
 
     def _stop_behind(self, observation: Observation) -> MissionCommand:
-        """Neutral sticks; over when it stands."""
-        if math.hypot(*observation.vehicle.v_ned_m_s) < 0.2:
+        """Neutral sticks; the mission is over when the vehicle has stopped."""
+        if math.hypot(*observation.vehicle.v_ned_m_s) < STOPPED_M_S:
             self._phase = Phase.OVER
-            return self._command(observation, Intent.DONE, Reason.GOAL_REACHED)
-        return self._command(observation, Intent.STOP, None)
+            return self._command(observation, Decision(Intent.DONE, Reason.GOAL_REACHED))
+        return self._command(observation, Decision(Intent.STOP))
 
-    @property
-    def _seen_beyond_m(self) -> float:
-        """Room behind the wall: what one frame alone takes for an obstacle there is not believed."""
-        return max(self._beyond_m, default=0.0)
-
-    def _ahead(self) -> Array:
-        yaw_rad = self._heading_rad()
-        return np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
-
-    def _heading_rad(self) -> float:
-        """Heading of the wall's normal; of a wall that turns, the middle one."""
-        return wrap_rad(self._yaw_rad + float(self._yaw.middle[1]))
-
-    def _command(
-        self,
-        observation: Observation,
-        intent: Intent,
-        reason: Reason | None,
-        *,
-        line: Line | None = None,
-        yaw_rad: float | None = None,
-        v_ned_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        clear_m: float = 0.0,
-        z_m: float = math.nan,
-        contour_m: float = math.nan,
-        text: str = "",
-    ) -> MissionCommand:
-        self._seq += 1
-        z_c_m = z_m if math.isnan(contour_m) else contour_m
+    def _command(self, observation: Observation, decision: Decision, contour_m: float = math.nan) -> MissionCommand:
+        """Return the command with its baseline: b = K Z_C in the approach, where Z_C is known; else the smallest."""
         low, high = self.craft.baseline_range_m
-        following = self._phase is Phase.APPROACH
-        wanted_m = baseline_for(z_c_m, self.parameters.baseline_gain, (low, high))
-        if math.isnan(z_c_m):
-            wanted_m = observation.baseline_m  # eyes that go to and fro lose their scale
-        baseline_m = wanted_m if following else low
-        return MissionCommand(
-            seq=self._seq,
-            t_ns=observation.now_ns,
-            expires_ns=observation.now_ns + round(3 * self.craft.frame_period_s * S),
-            intent=intent,
-            reason=reason,
-            v_ned_m_s=v_ned_m_s,
-            yaw_rad=yaw_rad,
-            height_m=None,
-            baseline_m=baseline_m,
-            clear_m=clear_m,
-            measured_ns=observation.vehicle.position_t_ns,
-            p_measured_ned_m=observation.vehicle.p_ned_m,
-            z_close_m=z_m,
-            detail=self._detail(z_c_m),
-            line=line,
-            text=text,
+        baseline_m = low
+        if self._phase is Phase.APPROACH:
+            baseline_m = baseline_law(contour_m, self.parameters.baseline_gain, (low, high))
+            if math.isnan(contour_m):
+                baseline_m = observation.baseline_m  # moving back and forth would make the scale uncertain
+        return self._commands.build(
+            observation, replace(decision, baseline_m=baseline_m, detail=self._detail(contour_m))
         )
 
-    def _detail(self, z_c_m: float) -> dict[str, float]:
-        chosen = self._chosen
+    def _detail(self, contour_m: float) -> dict[str, float]:
+        chosen, clearances_m = self._opening.chosen, self._opening.clearances_m
         if chosen is None:
             return {}
         return {
-            "range_m": z_c_m,
-            "room_m": self._room[-1] if self._room else math.nan,
+            "range_m": contour_m,
+            "room_m": clearances_m[-1] if clearances_m else math.nan,
             "opening_width_m": chosen.width_m,
             "opening_height_m": chosen.height_m,
-            "beyond_m": self._seen_beyond_m,
+            "beyond_m": self._opening.beyond_m(),
         }
 
 
-def _three(vector: Array) -> tuple[float, float, float]:
+def _triple(vector: Array) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])

@@ -1,1 +1,1 @@
-"""The mission that finds an independently moving object, tells where it is in 3D, and watches, pursues or dodges it."""
+"""The moving-object mission: detects and tracks an independently moving object in 3D; observes, pursues or dodges it."""

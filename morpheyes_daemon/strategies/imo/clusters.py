@@ -1,7 +1,7 @@
-"""Tracklets clustered by motion together with depth: neighbours in space that move alike are one object.
+"""Clustering of tracklets by motion together with depth (paper, section V-C).
 
-Two tracklets are linked when they lie within a hand's breadth at their depth and drift alike; a cluster is what hangs
-together. What an object is, and whether it is real, is decided over several frames by the track.
+Two tracklets are linked when they are close in the image at their depth and their image motion is similar; a cluster
+is a connected component. Whether a cluster is an object is confirmed over several frames by `tracker`.
 """
 
 from __future__ import annotations
@@ -10,29 +10,42 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.strategies.imo.features import Mask
-from morpheyes_daemon.strategies.imo.rectified_frame import Frame
-from morpheyes_daemon.strategies.imo.tracklets import Movers
+from morpheyes_daemon.messages.core import Mask
+from morpheyes_daemon.strategies.imo.rectified_frame import RectifiedFrame
+from morpheyes_daemon.strategies.imo.tracklets import MovingTracklets
 from morpheyes_daemon.transforms import Array
 
 LINK_M, LINK_PX = 0.12, 14.0
-"""Neighbours are at most this far apart in the image: at their depth, and in pixels at 640 px of width, added."""
+"""Largest distance of linked tracklets: metres at their depth plus pixels at 640 px of image width.
 
-ALIKE_PX, ALIKE_SHARE = 1.0, 0.35
-"""Drifts of neighbours differ by no more, per frame of comparison and as a share of the drift; an object may turn."""
+Chosen: the spacing of corners plus a hand's breadth; larger joins objects, smaller splits them."""
 
-DEPTH_PX, DEPTH_SHARE = 1.0, 0.08
-"""Disparities of neighbours differ by no more."""
+DRIFT_PX, DRIFT_SHARE = 1.0, 0.35
+"""Largest difference of image motion between linked tracklets, over the comparison and as a share.
 
-FEWEST = 3
-"""Tracklets that make an object."""
+Unit: px, none. Chosen: noise, and the different motion of the parts of a turning object; larger joins neighbours."""
+
+DISPARITY_PX, DISPARITY_SHARE = 1.0, 0.08
+"""Largest difference of disparity between linked tracklets, absolute and as a share. Unit: px, none.
+
+Chosen: matching error plus the depth of an object; larger joins it with its background."""
+
+MIN_TRACKLETS = 3
+"""Certainly moving tracklets that make a cluster. Unit: tracklets.
+
+Chosen: two agree by chance every few frames; more lose small objects."""
+
+RADIUS_PERCENTILE, RADIUS_MARGIN_M = 80, 0.03
+"""Percentile of the distances from the centre that is the radius, and what is added. Unit: %, m.
+
+Chosen: corners lie inside the contour, and single wrong members outside it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cluster:
-    """Tracklets that move together: middle (3,) and velocity (3,) in rect axes, and half its size.
+    """Tracklets that move together: centre (3,), metres, and velocity (3,), m/s, in rect, and radius.
 
-    `count` says how many of its members surely move.
+    `members` (M,) marks its tracklets, `count` is the number of them that certainly move.
     """
 
     members: Mask
@@ -42,27 +55,27 @@ class Cluster:
     radius_m: float
 
 
-def clusters(movers: Movers, frame: Frame) -> list[Cluster]:
-    """Return the objects among moving tracklets, the largest first."""
-    if movers.sure.sum() < FEWEST:
+def cluster_tracklets(moving: MovingTracklets, frame: RectifiedFrame) -> list[Cluster]:
+    """Return the clusters of moving tracklets, the largest first."""
+    if moving.certain.sum() < MIN_TRACKLETS:
         return []
-    labels = _components(_linked(movers, frame))
-    found = [_cluster(movers, labels == label) for label in range(labels.max() + 1)]
-    return sorted((c for c in found if c.count >= FEWEST), key=lambda c: -c.count)
+    labels = _components(_linked(moving, frame))
+    found = [_cluster(moving, labels == label) for label in range(labels.max() + 1)]
+    return sorted((c for c in found if c.count >= MIN_TRACKLETS), key=lambda c: -c.count)
 
 
-def _linked(movers: Movers, frame: Frame) -> Mask:
-    uv, d = movers.uvd[:, :2], movers.uvd[:, 2]
+def _linked(moving: MovingTracklets, frame: RectifiedFrame) -> Mask:
+    uv, d = moving.uvd[:, :2], moving.uvd[:, 2]
     reach = LINK_PX * frame.scale + LINK_M * d / frame.baseline_m
     apart = np.linalg.norm(uv[:, None] - uv[None], axis=2)
-    drift = movers.drift_px_s
-    unlike = np.linalg.norm(drift[:, None] - drift[None], axis=2)
+    drift = moving.drift_px_s
+    drift_difference = np.linalg.norm(drift[:, None] - drift[None], axis=2)
     size = np.linalg.norm(drift, axis=1)
-    noise = ALIKE_PX / movers.span_s
-    allowed = np.maximum(noise[:, None], noise[None]) + ALIKE_SHARE * np.maximum(size[:, None], size[None])
-    deeper = np.abs(d[:, None] - d[None])
-    same_depth = deeper < DEPTH_PX + DEPTH_SHARE * np.maximum(d[:, None], d[None])
-    return np.asarray((apart < np.minimum(reach[:, None], reach[None])) & (unlike < allowed) & same_depth)
+    noise = DRIFT_PX / moving.span_s
+    allowed = np.maximum(noise[:, None], noise[None]) + DRIFT_SHARE * np.maximum(size[:, None], size[None])
+    disparity_difference = np.abs(d[:, None] - d[None])
+    same_depth = disparity_difference < DISPARITY_PX + DISPARITY_SHARE * np.maximum(d[:, None], d[None])
+    return np.asarray((apart < np.minimum(reach[:, None], reach[None])) & (drift_difference < allowed) & same_depth)
 
 
 def _components(linked: Mask) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
@@ -80,10 +93,10 @@ def _components(linked: Mask) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return labels
 
 
-def _cluster(movers: Movers, members: Mask) -> Cluster:
-    p = movers.p_rect[members]
-    middle = np.median(p, axis=0)
-    across = np.linalg.norm(p[:, :2] - middle[:2], axis=1)
-    radius = float(np.percentile(across, 80)) + 0.03
-    sure = int((members & movers.sure).sum())
-    return Cluster(members, sure, middle, np.median(movers.v_rect_m_s[members], axis=0), radius)
+def _cluster(moving: MovingTracklets, members: Mask) -> Cluster:
+    p = moving.p_rect[members]
+    centre = np.median(p, axis=0)
+    across = np.linalg.norm(p[:, :2] - centre[:2], axis=1)
+    radius = float(np.percentile(across, RADIUS_PERCENTILE)) + RADIUS_MARGIN_M
+    count = int((members & moving.certain).sum())
+    return Cluster(members, count, centre, np.median(moving.v_rect_m_s[members], axis=0), radius)

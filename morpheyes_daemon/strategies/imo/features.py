@@ -1,6 +1,6 @@
-"""Corners, and finding them again: in the next frame and in the other eye, to a fraction of a pixel.
+"""Features: corner detection, and matching in the next frame and in the right camera to a fraction of a pixel.
 
-Pyramidal Lucas-Kanade of OpenCV, started from where geometry expects the corner and checked by going back.
+Pyramidal Lucas-Kanade of OpenCV, started at the position predicted by geometry, with a forward-backward check.
 """
 
 from __future__ import annotations
@@ -9,72 +9,123 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from morpheyes_daemon.messages.core import Image
+from morpheyes_daemon.messages.core import Image, Mask
 from morpheyes_daemon.stereo.lucas_kanade import follow
-from morpheyes_daemon.strategies.imo.rectified_frame import Frame
+from morpheyes_daemon.strategies.imo.rectified_frame import RectifiedFrame
 from morpheyes_daemon.transforms import Array
 
-Mask = NDArray[np.bool_]
-
 WINDOW_PX = 13
+"""Side of the Lucas-Kanade window.
+
+Chosen: the texture of small objects; larger mixes object and background, smaller finds less."""
+
 LEVELS = 2
-BACK_PX = 0.5
-"""A corner that does not come back to within this was not found."""
+"""Halvings of the image in the pyramid. Unit: levels.
+
+Chosen: errors of the predicted position up to about 25 px; more lose small objects."""
+
+RETURN_PX = 0.5
+"""Largest error of the forward-backward check.
+
+Chosen: above the matching noise of 0.3 px; larger accepts features that were lost."""
+
+ITERATIONS = 20
+"""Iterations of Lucas-Kanade on each level. Unit: iterations.
+
+Chosen: converges from a pixel in five to ten; more cost time in the vision worker."""
+
+MIN_TEXTURE = 1e-3
+"""Smallest eigenvalue of a window's gradients, per pixel, as OpenCV normalises it. Unit: none.
+
+Chosen: lower accepts features on flat texture, which drift."""
 
 ROW_PX = 1.2
-"""Rows of a rectified pair agree to within this."""
+"""Largest row offset of a match in a rectified pair.
+
+Chosen: four sigmas of matching noise; larger accepts matches across rows."""
+
+MIN_DISPARITY_PX = 0.3
+"""Smallest disparity of a match.
+
+Chosen: one sigma of its noise; at less the depth is unknown."""
 
 QUALITY = 0.01
+"""Quality of the weakest corner relative to the strongest. Unit: none.
 
-BLOCK_PX, FITS, NEAREST_M = 11, 0.85, 1.5
-"""Of the search along the row: the block, the correlation that counts, and how near it looks."""
+Chosen: OpenCV's usual value; higher finds corners on high-contrast objects only."""
 
-ROUNDS = 20
+CORNER_BLOCK_PX = 5
+"""Block over which the gradients of a corner are summed.
+
+Chosen: larger rounds the corners of small objects, smaller responds to noise."""
+
+BLOCK_PX = 11
+"""Side of the block in the search along the row.
+
+Chosen: smaller matches by chance, larger mixes object and background."""
+
+MIN_CORRELATION = 0.85
+"""Normalised cross-correlation from which a block in the search along the row matches. Unit: none.
+
+Chosen: lower accepts chance matches, higher loses matches at different gain."""
+
+NEAREST_M = 1.5
+"""Nearest depth of the search along the row.
+
+Chosen: what is nearer fills many pixels and is in the depth map; nearer searches cost time."""
+
+MIN_KNOWN = 3
+"""Known depths among 3 by 3 pixels from which their median is used. Unit: pixels.
+
+Chosen: a third; fewer are mismatches at an edge."""
 
 
-def corners(image: Image, count: int, spacing_px: float, free: NDArray[np.uint8] | None = None) -> Array:
-    """Return up to `count` corners (N, 2) at least `spacing_px` apart where `free` (H, W) is not zero."""
+def detect_corners(image: Image, count: int, spacing_px: float, free: NDArray[np.uint8] | None = None) -> Array:
+    """Return up to `count` corners (N, 2), px, of an image (H, W), `spacing_px` apart, where `free` (H, W) is not 0."""
     if count <= 0:
         return np.empty((0, 2))
-    found = cv2.goodFeaturesToTrack(image, count, QUALITY, spacing_px, mask=free, blockSize=5)
+    found = cv2.goodFeaturesToTrack(image, count, QUALITY, spacing_px, mask=free, blockSize=CORNER_BLOCK_PX)
     return np.empty((0, 2)) if found is None else np.asarray(found, dtype=np.float64).reshape(-1, 2)
 
 
-def followed(before: Image, now: Image, uv: Array, guess: Array) -> tuple[Array, Mask]:
-    """Return where pixels uv (N, 2) of `before` are in `now`, and which were found; NaN guesses start at uv."""
+def track_features(before: Image, now: Image, uv: Array, guess: Array) -> tuple[Array, Mask]:
+    """Return pixels (N, 2) in image `now` of pixels uv (N, 2) in `before`, (H, W) both, and which (N,) were found.
+
+    `guess` (N, 2), px, is where the search starts; NaN starts at uv.
+    """
     if not len(uv):
         return np.empty((0, 2)), np.zeros(0, dtype=np.bool_)
     start = np.where(np.isfinite(guess), guess, uv)
     return follow(
         before, now, uv, start,
-        window_px=WINDOW_PX, levels=LEVELS, least_texture=1e-3, rounds=ROUNDS, return_px=BACK_PX,
+        window_px=WINDOW_PX, levels=LEVELS, least_texture=MIN_TEXTURE, rounds=ITERATIONS, return_px=RETURN_PX,
     )  # fmt: skip
 
 
-def seen_by_both(frame: Frame, uv: Array, d_guess: Array) -> tuple[Array, Mask]:
-    """Return the disparities (N,) of pixels uv (N, 2) of the left eye near `d_guess` (N,), and which were found."""
+def stereo_disparity(frame: RectifiedFrame, uv: Array, d_guess: Array) -> tuple[Array, Mask]:
+    """Return disparities (N,), px, of pixels uv (N, 2) of the left image near `d_guess` (N,), and which were found."""
     guess = uv - np.stack([np.nan_to_num(d_guess), np.zeros(len(uv))], axis=1)
-    there, good = followed(frame.left, frame.right, uv, guess)
-    offset = uv - there
-    good &= np.isfinite(d_guess) & (np.abs(offset[:, 1]) < ROW_PX) & (offset[:, 0] > 0.3)
+    right, good = track_features(frame.left, frame.right, uv, guess)
+    offset = uv - right
+    good &= np.isfinite(d_guess) & (np.abs(offset[:, 1]) < ROW_PX) & (offset[:, 0] > MIN_DISPARITY_PX)
     return offset[:, 0], good
 
 
-def disparity_at(frame: Frame, uv: Array) -> Array:
-    """Return the disparities (N,) that the depth map has around pixels uv (N, 2): the median of 3 by 3, NaN unknown."""
+def depth_map_disparity(frame: RectifiedFrame, uv: Array) -> Array:
+    """Return disparities (N,), px, of the depth map at pixels uv (N, 2): the median of 3 by 3, NaN unknown."""
     column = np.clip(np.rint(uv[:, 0]).astype(np.intp), 1, frame.pinhole.width - 2)
     row = np.clip(np.rint(uv[:, 1]).astype(np.intp), 1, frame.pinhole.height - 2)
     around = np.stack([frame.depth_m[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=1)
     known = np.sort(around, axis=1)
     count = np.isfinite(around).sum(axis=1)
     middle = known[np.arange(len(uv)), np.maximum(count - 1, 0) // 2]
-    return np.where(count >= 3, frame.bf_m_px / middle, np.nan)
+    return np.where(count >= MIN_KNOWN, frame.bf_m_px / middle, np.nan)
 
 
-def disparity_along_row(frame: Frame, uv: Array) -> Array:
-    """Return the disparities (N,) at which a small block around pixels uv (N, 2) fits the right eye best.
+def disparity_along_row(frame: RectifiedFrame, uv: Array) -> Array:
+    """Return disparities (N,), whole px, of the best match of a block around pixels uv (N, 2) in the right image.
 
-    Whole pixels, by normalised cross-correlation along the row; NaN where nothing fits. For what the depth map forgot.
+    Normalised cross-correlation along the row; NaN where nothing matches. For small objects missing in the depth map.
     """
     found = np.full(len(uv), np.nan)
     half, (height, width) = BLOCK_PX // 2, frame.left.shape
@@ -87,6 +138,6 @@ def disparity_along_row(frame: Frame, uv: Array) -> Array:
         strip = frame.right[rows, first : u + half + 1]
         fit = cv2.matchTemplate(strip, frame.left[rows, u - half : u + half + 1], cv2.TM_CCOEFF_NORMED)[0]
         best = int(np.argmax(fit))
-        if fit[best] > FITS:
+        if fit[best] > MIN_CORRELATION:
             found[k] = u - half - first - best
     return found

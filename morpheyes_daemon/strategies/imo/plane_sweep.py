@@ -1,7 +1,7 @@
-"""Depth of a small window by plane sweep: what dense matching of the whole image smooths away, looked for on its own.
+"""Plane sweep: depth of a small window whose object dense matching of the whole image may smooth away.
 
-Semi-global matching likes large surfaces and forgets patches of a dozen pixels before a far wall. Here every pixel of
-a window takes the disparity at which a small block around it fits best; nothing is smoothed.
+Semi-global matching prefers large surfaces and loses patches of a dozen pixels before a far wall. Here every pixel of
+a window takes the disparity of the best matching block around it, without smoothing.
 """
 
 from __future__ import annotations
@@ -10,17 +10,23 @@ import cv2
 import numpy as np
 
 from morpheyes_daemon.messages.core import FloatMap
-from morpheyes_daemon.strategies.imo.rectified_frame import Frame
+from morpheyes_daemon.strategies.imo.rectified_frame import RectifiedFrame
 
 BLOCK_PX = 5
+"""Side of the compared block.
+
+Chosen: smaller matches noise, larger rounds objects of a dozen pixels."""
+
 BRIGHTNESS_PX = 15
-"""Blocks are compared without the mean brightness over so many pixels: the eyes differ in gain."""
+"""Window whose mean is subtracted before blocks are compared, since the cameras differ in gain.
+
+Chosen: three blocks; smaller removes the texture itself."""
 
 
-def swept_depth(frame: Frame, box: tuple[slice, slice], nearest_m: float, farthest_m: float) -> FloatMap:
-    """Return depth (h, w) metres of the window `box` (rows, columns) of the left eye, within the given range.
+def plane_sweep_depth(frame: RectifiedFrame, box: tuple[slice, slice], nearest_m: float, farthest_m: float) -> FloatMap:
+    """Return depth (h, w), metres, of the window `box` (rows, columns) of the left image, within the given range.
 
-    NaN where the right eye cannot see it at any of the disparities.
+    NaN where the right image does not contain any of the disparities.
     """
     rows, columns = box
     low = max(0, int(frame.bf_m_px / farthest_m))
@@ -43,16 +49,15 @@ def swept_depth(frame: Frame, box: tuple[slice, slice], nearest_m: float, farthe
 
 
 def _flat(image: np.ndarray[tuple[int, int], np.dtype[np.uint8]]) -> FloatMap:
-    """Return the image without its local mean."""
+    """Return the image (h, w) minus its local mean."""
     grey = image.astype(np.float32)
     return np.asarray(grey - cv2.blur(grey, (BRIGHTNESS_PX, BRIGHTNESS_PX)))
 
 
 def _lowest(costs: FloatMap) -> FloatMap:
-    """Return where along the first axis costs (N, h, w) are least, to a fraction of a step; NaN where none is known.
+    """Return the index (h, w) of the minimum of costs (N, h, w) along the first axis, with a fraction; NaN without any.
 
-    Absolute differences fall and rise in straight lines, so two of equal slope are laid through the least and its
-    neighbours.
+    Absolute differences are piecewise linear, so two lines of equal slope are fitted to the minimum and its neighbours.
     """
     at = np.argmin(costs, axis=0)
     padded = np.pad(costs, ((1, 1), (0, 0), (0, 0)), constant_values=np.inf)

@@ -1,1 +1,1 @@
-"""What a depth map says about obstacles: polar profile, corridor, ground slope."""
+"""Obstacles in a depth map: polar profile, corridor, ground slope."""

@@ -1,17 +1,17 @@
-"""How far a corridor as wide as the vehicle is free in many directions at once."""
+"""Free distance along a corridor as wide as the vehicle, for many headings at once."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from morpheyes_daemon.strategies.obstacles.polar_profile import Floats
+from morpheyes_daemon.transforms import Array
 
 
-def free_distance_m(points_m: Floats, headings_rad: Floats, half_width_m: float, reach_m: float) -> Floats:
-    """Return (M,) how far a disc of radius `half_width_m` can move from the origin along each heading.
+def free_distance_m(points_m: Array, headings_rad: Array, half_width_m: float, reach_m: float) -> Array:
+    """Return (M,) how far a disc of radius `half_width_m` can move from the origin along each heading, metres.
 
-    points_m: (N, 2) obstacle points relative to the disc's centre. Capped at `reach_m`. A point already inside the
-    disc blocks the headings that approach it and no others.
+    points_m: (N, 2) obstacle points relative to the disc's centre, metres north and east. headings_rad: (M,). The
+    result is at most `reach_m`. A point already inside the disc blocks the headings that approach it and no others.
     """
     free = np.full(headings_rad.shape, reach_m)
     near = points_m[np.hypot(points_m[:, 0], points_m[:, 1]) < reach_m + half_width_m]

@@ -1,4 +1,4 @@
-"""The governor: whatever it is told, the vehicle can stop within what it has seen and can trust."""
+"""The governor: for any command the vehicle can stop within free space and trusted range."""
 
 import math
 from dataclasses import replace
@@ -35,8 +35,8 @@ def flying(speed: float, flown_m: float = 0.0) -> VehicleState:
 
 
 @given(st.floats(0.0, 40.0), st.floats(0.0, 5.0), st.floats(0.0, 6.0))
-def test_it_always_leaves_room_to_stop_after_the_daemons_death(clear: float, speed: float, flown: float) -> None:
-    governed = Governor(LIMITS).limit(command(clear), SEEN, flying(speed, flown), MODEL, 1.5, 0)
+def test_the_limit_leaves_room_to_stop_after_the_daemons_death(clear: float, speed: float, flown: float) -> None:
+    governed = Governor(LIMITS).limit(command(clear), SEEN, flying(speed, flown), MODEL, 0)
     if governed.limit_m_s > 0.0:
         needed = MODEL.stopping_distance_m(governed.limit_m_s, 1.5, LIMITS.dead_daemon_s)
         assert needed <= min(clear, governed.trust_m) - flown + 1e-6
@@ -44,7 +44,7 @@ def test_it_always_leaves_room_to_stop_after_the_daemons_death(clear: float, spe
 
 @given(st.floats(0.0, 12.0), st.floats(0.0, 4.0))
 def test_a_stick_held_by_a_dead_daemon_still_leaves_room_to_stop(clear: float, speed: float) -> None:
-    governed = Governor(LIMITS).limit(command(clear), SEEN, flying(speed), MODEL, 1.5, 0)
+    governed = Governor(LIMITS).limit(command(clear), SEEN, flying(speed), MODEL, 0)
     u, tau = governed.stick_limit_m_s, MODEL.time_constant_s(1.5)
     if u <= 0.0:
         return
@@ -55,32 +55,32 @@ def test_a_stick_held_by_a_dead_daemon_still_leaves_room_to_stop(clear: float, s
 
 
 @given(st.floats(0.0, 30.0), st.floats(0.0, 5.0))
-def test_more_room_never_means_slower(clear: float, more: float) -> None:
+def test_more_free_distance_never_means_slower(clear: float, more: float) -> None:
     governor = Governor(LIMITS)
-    less = governor.limit(command(clear), SEEN, flying(1.0), MODEL, 1.5, 0).limit_m_s
-    assert governor.limit(command(clear + more), SEEN, flying(1.0), MODEL, 1.5, 0).limit_m_s >= less - 1e-9
+    less = governor.limit(command(clear), SEEN, flying(1.0), MODEL, 0).limit_m_s
+    assert governor.limit(command(clear + more), SEEN, flying(1.0), MODEL, 0).limit_m_s >= less - 1e-9
 
 
 @pytest.mark.parametrize("clear", [math.nan, -math.inf, -1.0, 0.0])
-def test_nonsense_and_no_room_mean_standing_still(clear: float) -> None:
-    governed = Governor(LIMITS).limit(command(clear), SEEN, flying(1.0), MODEL, 1.5, 0)
+def test_invalid_or_no_free_distance_means_standing_still(clear: float) -> None:
+    governed = Governor(LIMITS).limit(command(clear), SEEN, flying(1.0), MODEL, 0)
     assert governed.limit_m_s == 0.0
     assert governed.stick_limit_m_s < 0.01
 
 
-def test_trust_ends_where_three_sigmas_are_a_fifth_of_the_depth() -> None:
+def test_trusted_range_ends_where_three_sigmas_are_a_fifth_of_the_depth() -> None:
     z = trust_range_m(SEEN, 3.0, 0.2)
     sigma = math.hypot(z * z * 0.25 / (0.2 * 370.0), z * 0.0005 / 0.2)
     assert 3.0 * sigma / z == pytest.approx(0.2, rel=1e-9)
 
 
-def test_a_baseline_nobody_knows_is_trusted_nowhere() -> None:
+def test_an_unknown_baseline_has_no_trusted_range() -> None:
     assert trust_range_m(replace(SEEN, baseline_sigma_m=0.05), 3.0, 0.2) == 0.0
 
 
-def test_time_between_the_eyes_slows_down_near_obstacles() -> None:
+def test_a_time_offset_of_the_cameras_slows_down_near_obstacles() -> None:
     slow = Governor(replace(LIMITS, sync_error_s=0.02))
-    governed = slow.limit(replace(command(40.0), z_close_m=2.0), SEEN, flying(1.0), MODEL, 1.5, 0)
+    governed = slow.limit(replace(command(40.0), z_close_m=2.0), SEEN, flying(1.0), MODEL, 0)
     assert governed.bound == "sync"
     d = 0.2 * 370.0 / 2.0
     assert governed.limit_m_s == pytest.approx(min(2.0 / (160 + d + 1), 2.0 / 370.0) / 0.02, rel=1e-6)

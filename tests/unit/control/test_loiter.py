@@ -147,7 +147,7 @@ def test_faster_never_stops_sooner(model: LoiterModel, height_m: float, a: float
 
 @given(st.integers(1000, 1200), st.integers(1800, 2100), st.integers(1400, 1600), st.integers(0, 60), st.booleans(),
        st.floats(-1, 1))  # fmt: skip
-def test_no_command_is_lost_in_the_dead_zone(
+def test_no_deflection_falls_into_the_dead_zone(
     low: int, high: int, trim: int, dead: int, is_reversed: bool, n: float
 ) -> None:
     axis = StickAxis(1, low, high, trim, dead, is_reversed)
@@ -157,7 +157,7 @@ def test_no_command_is_lost_in_the_dead_zone(
     assert axis.deflection(width) == pytest.approx(n, abs=1.5 / (min(trim - low, high - trim) - dead))
 
 
-def test_nothing_free_means_no_speed() -> None:
+def test_no_free_distance_means_no_speed() -> None:
     for distance in (0.0, -1.0, math.nan):
         assert MODELS[0].speed_for_distance_m(distance, 1.0) == 0.0
 

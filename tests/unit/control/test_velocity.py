@@ -10,7 +10,7 @@ import pytest
 
 from morpheyes_daemon.clock import MS, S
 from morpheyes_daemon.control.loiter import LoiterModel
-from morpheyes_daemon.control.velocity import VelocityController, VelocityTuning, height_above_ground_m
+from morpheyes_daemon.control.velocity import VelocityController, VelocitySetpoint, VelocityTuning, height_above_ground_m
 from morpheyes_daemon.messages.core import Sticks, VehicleState
 from tests.support.copter_parameters import copter_parameters
 from tests.support.loiter_plant import LoiterPlant
@@ -52,7 +52,7 @@ class Flight:
                     v_ned_m_s=(v[0] + noise.gauss(0, NOISE_M_S), v[1] + noise.gauss(0, NOISE_M_S), 0.0),
                 )
                 north, east, heading = profile(ms / 1000)
-                s = self.controller.step(now, (north, east, 0.0), heading, 1.5, state)
+                s = self.controller.step(VelocitySetpoint((north, east, 0.0), heading, 1.5), state, now)
                 self.sticks.append(s)
             plant.step_ms(
                 -self.model.pitch.deflection(s.pitch_us),
@@ -76,7 +76,7 @@ class Flight:
 
 @pytest.mark.parametrize(("loit_speed", "rise_s"), [(300, 2.2), (500, 1.5), (1250, 1.4)])
 @pytest.mark.parametrize("latency_ms", [30, 100, 200])
-def test_steps_are_quick_without_overshoot(loit_speed: float, rise_s: float, latency_ms: int) -> None:
+def test_steps_rise_in_time_without_overshoot(loit_speed: float, rise_s: float, latency_ms: int) -> None:
     flight = Flight(loit_speed)
     flight.fly(9.0, lambda t: (2.9 if t < 5 else 1.0, 0.0, 0.0), latency_ms=latency_ms)
     assert flight.rise_s(0.0, 0.0, 2.9) < rise_s
@@ -86,7 +86,7 @@ def test_steps_are_quick_without_overshoot(loit_speed: float, rise_s: float, lat
 
 
 @pytest.mark.parametrize(("north", "east"), [(3.7, -1.4), (1.0, 3.8), (-2.5, 2.9)])
-def test_the_course_is_the_one_wanted_while_the_lean_is_at_its_bound(north: float, east: float) -> None:
+def test_a_bounded_lean_keeps_the_wanted_course(north: float, east: float) -> None:
     flight = Flight()
     flight.fly(1.2, lambda t: (north, east, 0.0))
     most = max(math.hypot(*flight.deflections(s)) for s in flight.sticks)
@@ -113,7 +113,7 @@ def test_stop_is_neutral_sticks_and_comes_to_rest() -> None:
     assert min(v for v, _ in flight.track) > -0.02
 
 
-def test_active_stop_is_shorter_and_hardly_reverses() -> None:
+def test_an_active_stop_is_shorter_and_hardly_reverses() -> None:
     ends = []
     for lean_deg in (0.0, 15.0):
         flight = Flight(tuning=VelocityTuning(stop_lean_rad=math.radians(lean_deg)))
@@ -138,24 +138,25 @@ def test_lean_stays_bounded() -> None:
 def test_coast_keeps_pitch_and_roll_neutral() -> None:
     model = LoiterModel.from_parameters(copter_parameters())
     state = VehicleState(p_ned_m=(0, 0, -1.0), v_ned_m_s=(1.0, 0.5, 0.0))
-    s = VelocityController(model).step(S, (3.0, 0.0, 0.0), 0.5, 1.5, state, coast=True)
+    s = VelocityController(model).step(VelocitySetpoint((3.0, 0.0, 0.0), 0.5, 1.5, coast=True), state, S)
     assert (s.roll_us, s.pitch_us) == (1500, 1500)
     assert s.yaw_us > 1520
     assert s.throttle_us > 1600
 
 
-def test_height_error_moves_the_throttle_beyond_its_dead_band_only_when_it_matters() -> None:
+def test_a_height_error_within_tolerance_keeps_the_throttle_neutral() -> None:
     controller = VelocityController(LoiterModel.from_parameters(copter_parameters()))
 
     def throttle(height_m: float) -> int:
-        return controller.step(S, (0.0, 0.0, 0.0), None, 1.5, VehicleState(p_ned_m=(0, 0, -height_m))).throttle_us
+        vehicle = VehicleState(p_ned_m=(0, 0, -height_m))
+        return controller.step(VelocitySetpoint((0.0, 0.0, 0.0), height_m=1.5), vehicle, S).throttle_us
 
     assert throttle(1.46) == 1500
     assert throttle(1.0) > 1600
     assert throttle(2.0) < 1400
 
 
-def test_rangefinder_counts_while_it_is_fresh() -> None:
+def test_the_rangefinder_is_used_while_it_is_fresh() -> None:
     state = VehicleState(height_m=1.2, height_t_ns=10 * S, p_ned_m=(0, 0, -2.0))
     assert height_above_ground_m(state, 10 * S + 100 * MS) == 1.2
     assert height_above_ground_m(state, 11 * S) == 2.0

@@ -1,4 +1,4 @@
-"""What the configuration says about leaning, in the velocity loop's bounds."""
+"""The lean bounds of the velocity loop from the configuration."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def config(**safety: float) -> VehicleConfig:
     return VehicleConfig(camera=SimCameraConfig(), servo=NoServoConfig(backend="none"), safety=SafetyConfig(**safety))
 
 
-def test_a_stop_is_neutral_unless_active_braking_is_asked_for() -> None:
+def test_a_stop_is_neutral_without_active_braking() -> None:
     model = LoiterModel.from_parameters(copter_parameters())
     assert velocity_tuning(config(), model).stop_lean_rad == 0.0
     assert velocity_tuning(config(active_braking=True), model).stop_lean_rad == pytest.approx(BRAKE_LEAN_RAD)

@@ -1,4 +1,4 @@
-"""Openings are found where they are, measured as they are passed, and a wall without one has none."""
+"""Openings are found and measured in projection along the wall's normal; a wall without one has none."""
 
 import math
 
@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.gap.openings import Silhouette, find_openings, passage
-from morpheyes_daemon.strategies.gap.wall_segmentation import median, split
+from morpheyes_daemon.strategies.gap.openings import Silhouette, crossing_frame, find_openings
+from morpheyes_daemon.strategies.gap.wall_segmentation import median, segment_wall
 from tests.support.walls import PINHOLE, T_ned_rect, depth_map, depth_of_wall, rectangle
 
 VEHICLE = Silhouette(0.337, 0.187)
@@ -16,19 +16,19 @@ PX_M = 4.0 / PINHOLE.f_px
 
 
 def openings(depth, T):
-    found = split(depth)
+    found = segment_wall(depth)
     assert found is not None
-    way = passage(found.plane, depth.pinhole, T)
+    way = crossing_frame(found.plane, depth.pinhole, T)
     assert way is not None
     return find_openings(depth, found, way, VEHICLE)
 
 
-def test_the_vehicle_is_set_in_the_middle_of_a_rectangle_with_the_room_there_is():
+def test_the_crossing_point_of_a_rectangle_is_its_centre_with_its_clearance():
     T = T_ned_rect()
     depth, _ = depth_of_wall([rectangle(0.2, -1.4, 0.417, 0.267)], T)
     (opening,) = openings(depth, T)
-    assert opening.places[0].p_ned_m == pytest.approx((4.0, 0.2, -1.4), abs=1.5 * PX_M)
-    assert opening.places[0].clearance_m == pytest.approx(0.040, abs=1.5 * PX_M)
+    assert opening.crossing_points[0].p_ned_m == pytest.approx((4.0, 0.2, -1.4), abs=1.5 * PX_M)
+    assert opening.crossing_points[0].clearance_m == pytest.approx(0.040, abs=1.5 * PX_M)
     assert (opening.width_m, opening.height_m) == pytest.approx((0.417, 0.267), abs=2 * PX_M)
     assert opening.z_m == pytest.approx(4.0, abs=0.05)
     assert not opening.cut
@@ -44,11 +44,11 @@ def test_the_contour_covers_the_hole():
     assert (seen & hole).sum() / (seen | hole).sum() > 0.95
 
 
-def test_a_turned_wall_is_measured_square_to_its_own_normal():
+def test_an_oblique_wall_is_measured_along_its_normal():
     T, turn = T_ned_rect(), math.radians(12)
     depth, _ = depth_of_wall([rectangle(0.0, -1.5, 0.6, 0.4)], T, turn_rad=turn)
-    found = split(depth)
-    way = passage(found.plane, depth.pinhole, T)
+    found = segment_wall(depth)
+    way = crossing_frame(found.plane, depth.pinhole, T)
     assert way.yaw_rad == pytest.approx(turn, abs=0.01)
     (opening,) = find_openings(depth, found, way, VEHICLE)
     assert opening.width_m == pytest.approx(0.6, abs=2 * PX_M)
@@ -58,27 +58,27 @@ def test_a_leaning_camera_does_not_move_the_opening():
     T = T_ned_rect(pitch=-0.15, roll=0.05, yaw=0.05)
     depth, _ = depth_of_wall([rectangle(0.1, -1.2, 0.417, 0.267)], T)
     (opening,) = openings(depth, T)
-    assert opening.places[0].p_ned_m == pytest.approx((4.0, 0.1, -1.2), abs=1.5 * PX_M)
+    assert opening.crossing_points[0].p_ned_m == pytest.approx((4.0, 0.1, -1.2), abs=1.5 * PX_M)
 
 
-def test_room_is_negative_where_it_does_not_fit():
+def test_clearance_is_negative_where_it_does_not_fit():
     T = T_ned_rect()
     depth, _ = depth_of_wall([rectangle(0.0, -1.5, 0.417, 0.147)], T)
     (opening,) = openings(depth, T)
-    assert opening.places[0].clearance_m == pytest.approx(-0.020, abs=1.5 * PX_M)
+    assert opening.crossing_points[0].clearance_m == pytest.approx(-0.020, abs=1.5 * PX_M)
 
 
-def test_several_openings_are_all_found_and_the_roomiest_is_known():
+def test_several_openings_are_all_found_and_the_largest_has_most_clearance():
     T = T_ned_rect()
     holes = [rectangle(-0.7, -1.5, 0.38, 0.24), rectangle(0.5, -1.6, 0.6, 0.5)]
     found = openings(depth_of_wall(holes, T)[0], T)
     assert len(found) == 2
-    best = max(found, key=lambda opening: opening.places[0].clearance_m)
-    assert best.places[0].p_ned_m[1] == pytest.approx(0.5, abs=0.05)
+    best = max(found, key=lambda opening: opening.crossing_points[0].clearance_m)
+    assert best.crossing_points[0].p_ned_m[1] == pytest.approx(0.5, abs=0.05)
 
 
-def test_what_nobody_sees_at_the_rim_belongs_to_the_opening():
-    """The strip that only the left eye sees has no depth; counted as wall it would shift the middle."""
+def test_the_half_occluded_rim_belongs_to_the_opening():
+    """The half-occluded strip has no depth; counted as wall it would shift the centre."""
     T = T_ned_rect()
     depth, hole = depth_of_wall([rectangle(0.0, -1.5, 0.5, 0.4)], T)
     seen = depth.depth_m.copy()
@@ -87,7 +87,7 @@ def test_what_nobody_sees_at_the_rim_belongs_to_the_opening():
     strip[:, : columns[-1] - 8] = False
     seen[strip] = np.nan
     (opening,) = openings(depth_map(seen), T)
-    assert opening.places[0].p_ned_m[1] == pytest.approx(0.0, abs=1.5 * PX_M)
+    assert opening.crossing_points[0].p_ned_m[1] == pytest.approx(0.0, abs=1.5 * PX_M)
 
 
 def test_a_hole_at_the_edge_of_the_image_is_cut():
@@ -96,7 +96,7 @@ def test_a_hole_at_the_edge_of_the_image_is_cut():
     assert opening.cut
 
 
-def test_behind_the_wall_the_first_thing_in_the_way_counts():
+def test_the_nearest_obstacle_behind_the_wall_counts():
     T = T_ned_rect()
     (opening,) = openings(depth_of_wall([rectangle(0.0, -1.5, 0.6, 0.4)], T, back_m=3.0)[0], T)
     assert opening.beyond_m == pytest.approx(3.0, abs=0.5)
@@ -105,19 +105,19 @@ def test_behind_the_wall_the_first_thing_in_the_way_counts():
 def test_a_plain_wall_is_not_bimodal():
     T = T_ned_rect()
     depth, _ = depth_of_wall([], T, turn_rad=0.2)
-    found = split(depth)
+    found = segment_wall(depth)
     assert not found.bimodal
-    assert find_openings(depth, found, passage(found.plane, PINHOLE, T), VEHICLE) == ()
+    assert find_openings(depth, found, crossing_frame(found.plane, PINHOLE, T), VEHICLE) == ()
 
 
 def test_without_depth_there_is_no_wall():
-    assert split(depth_map(np.full((240, 320), np.nan))) is None
+    assert segment_wall(depth_map(np.full((240, 320), np.nan))) is None
 
 
-def test_the_safest_point_of_a_symmetric_hole_is_its_middle():
+def test_the_safe_point_of_a_symmetric_hole_is_its_centre():
     T = T_ned_rect()
     (opening,) = openings(depth_of_wall([rectangle(0.1, -1.5, 0.5, 0.4)], T)[0], T)
-    assert opening.safest.p_ned_m[1:] == pytest.approx((0.1, -1.5), abs=3 * PX_M)
+    assert opening.safe_point.p_ned_m[1:] == pytest.approx((0.1, -1.5), abs=3 * PX_M)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -1,4 +1,4 @@
-"""The gap mission decides: it measures before it runs, refuses what is too small, and stops behind."""
+"""Decisions of the gap mission: it measures before the run, refuses small openings, and stops behind the wall."""
 
 import math
 from dataclasses import replace
@@ -12,7 +12,7 @@ from morpheyes_daemon.messages.core import DepthSummary, Intent, VehicleState
 from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft
-from morpheyes_daemon.strategies.gap.openings import Opening, Place
+from morpheyes_daemon.strategies.gap.openings import CrossingPoint, Opening
 from morpheyes_daemon.strategies.gap.parameters import GapParameters
 from morpheyes_daemon.strategies.gap.perception import GapPercept
 from morpheyes_daemon.strategies.gap.strategy import Gap, Phase
@@ -23,19 +23,19 @@ WALL_M, BEYOND_M = 7.0, 8.0
 
 
 def opening(place=(WALL_M, 0.2, -1.4), room_m=0.04, z_m=4.0, cut=False):
-    at = Place(place, room_m)
+    at = CrossingPoint(place, room_m)
     width, height = 0.337 + 2 * room_m, 0.187 + 2 * room_m
     return Opening(np.zeros((4, 2), np.float32), z_m, (at,), at, width, height, BEYOND_M, cut)
 
 
 class Course:
-    """A vehicle that does what it is told as soon as it leans, and a strategy that sees what `show` says."""
+    """A vehicle that follows its commands with the lag of a lean, and a strategy that gets the openings of `show`."""
 
     def __init__(self, show, **parameters):
         self.strategy = Gap(GapParameters(**parameters), CRAFT)
         self.show, self.now_ns = show, 10 * S
         self.vehicle = VehicleState(p_ned_m=(0.0, 0.0, -1.5))
-        self.keeper = PathFollower()
+        self.path = PathFollower()
         self.baseline_m = 0.3
         self.commands, self.phases, self.ranges = [], [], []
         self.step(engaged=False)
@@ -68,7 +68,7 @@ class Course:
     def move(self, command, now_ns):
         """One stick period."""
         flies = command.intent is Intent.FLY
-        wanted = self.keeper.wanted_velocity(command, self.vehicle, now_ns) if flies else (0.0, 0.0, 0.0)
+        wanted = self.path.wanted_velocity(command, self.vehicle, now_ns) if flies else (0.0, 0.0, 0.0)
         v = [u + 0.02 / LEAN_LAG_S * (w - u) for u, w in zip(self.vehicle.v_ned_m_s, wanted, strict=True)]
         north, east, down = (p + 0.02 * u for p, u in zip(self.vehicle.p_ned_m, v, strict=True))
         self.vehicle = replace(self.vehicle, p_ned_m=(north, east, down), v_ned_m_s=tuple(float(u) for u in v))
@@ -81,12 +81,12 @@ class Course:
         return command
 
 
-def seen_from_afar(range_m, **what):
+def visible_until_near(range_m, **what):
     return [opening(z_m=range_m, **what)] if range_m > 0.7 else []
 
 
-def test_it_measures_closes_the_eyes_runs_through_and_stops_behind():
-    course = Course(seen_from_afar)
+def test_the_phases_of_a_flight_through_follow_in_order():
+    course = Course(visible_until_near)
     last = course.fly(30.0)
     assert (last.intent, last.reason) == (Intent.DONE, Reason.GOAL_REACHED)
     met = list(dict.fromkeys(course.phases))
@@ -96,8 +96,8 @@ def test_it_measures_closes_the_eyes_runs_through_and_stops_behind():
     assert course.vehicle.p_ned_m[0] > WALL_M + 0.5
 
 
-def test_before_the_run_the_wall_is_where_free_space_ends():
-    course = Course(seen_from_afar)
+def test_before_the_run_free_space_ends_at_the_wall():
+    course = Course(visible_until_near)
     course.fly(30.0)
     rows = zip(course.phases, course.ranges, course.commands, strict=True)
     for phase, range_m, command in rows:
@@ -108,8 +108,8 @@ def test_before_the_run_the_wall_is_where_free_space_ends():
             assert command.baseline_m == CRAFT.baseline_range_m[0]
 
 
-def test_the_run_waits_until_the_eyes_are_together():
-    course = Course(seen_from_afar)
+def test_the_run_waits_for_the_smallest_baseline():
+    course = Course(visible_until_near)
     course.fly(30.0)
     first = course.phases.index(Phase.RUN)
     closing = [command for command, phase in zip(course.commands, course.phases, strict=True) if phase is Phase.CLOSE]
@@ -117,8 +117,8 @@ def test_the_run_waits_until_the_eyes_are_together():
     assert first - course.phases.index(Phase.CLOSE) >= 5
 
 
-def test_what_is_too_small_is_refused_with_its_size_and_its_own():
-    course = Course(lambda range_m: seen_from_afar(range_m, room_m=-0.03))
+def test_a_refusal_names_the_sizes_of_opening_and_vehicle():
+    course = Course(lambda range_m: visible_until_near(range_m, room_m=-0.03))
     last = course.fly(40.0)
     assert (last.intent, last.reason) == (Intent.REFUSE, Reason.MISSION_REFUSED)
     assert "0.28 x 0.13 m" in last.text
@@ -127,56 +127,56 @@ def test_what_is_too_small_is_refused_with_its_size_and_its_own():
     assert WALL_M - course.vehicle.p_ned_m[0] > 3.0
 
 
-def test_of_several_openings_it_takes_the_one_with_most_room():
+def test_the_opening_with_the_largest_clearance_is_chosen():
     def two(range_m):
         place = (WALL_M, -0.6, -1.6)
-        return [*seen_from_afar(range_m, room_m=0.01), *seen_from_afar(range_m, room_m=0.2, place=place)]
+        return [*visible_until_near(range_m, room_m=0.01), *visible_until_near(range_m, room_m=0.2, place=place)]
 
     course = Course(two)
     assert course.fly(30.0).reason is Reason.GOAL_REACHED
     assert course.vehicle.p_ned_m[1] == pytest.approx(-0.6, abs=0.05)
 
 
-def test_an_opening_that_seemed_roomier_from_afar_is_given_up_for_the_one_that_is():
+def test_an_opening_that_proves_larger_is_chosen_instead():
     def two(range_m):
         seems_m = 0.3 if range_m > 6.5 else 0.01
         place = (WALL_M, -0.6, -1.6)
-        return [*seen_from_afar(range_m, room_m=seems_m), *seen_from_afar(range_m, room_m=0.1, place=place)]
+        return [*visible_until_near(range_m, room_m=seems_m), *visible_until_near(range_m, room_m=0.1, place=place)]
 
     course = Course(two)
     assert course.fly(30.0).reason is Reason.GOAL_REACHED
     assert course.vehicle.p_ned_m[1] == pytest.approx(-0.6, abs=0.05)
 
 
-def test_of_two_openings_alike_it_keeps_to_one():
+def test_between_equal_openings_the_choice_does_not_change():
     flips = iter([0.05, 0.0] * 500)
 
     def two(range_m):
         more_m = next(flips)
         place = (WALL_M, -0.6, -1.6)
-        return [*seen_from_afar(range_m, room_m=0.1), *seen_from_afar(range_m, room_m=0.1 + more_m, place=place)]
+        return [*visible_until_near(range_m, room_m=0.1), *visible_until_near(range_m, room_m=0.1 + more_m, place=place)]
 
     course = Course(two)
     assert course.fly(30.0).reason is Reason.GOAL_REACHED
     assert len({round(command.line.p_ned_m[1], 1) for command in course.commands if command.line}) == 1
 
 
-def test_without_an_opening_it_refuses_after_a_look():
+def test_without_an_opening_it_refuses_after_a_time():
     course = Course(lambda range_m: [], look_s=12.0)
     last = course.fly(20.0)
     assert (last.intent, last.text) == (Intent.REFUSE, "no opening in the wall")
     assert WALL_M - course.vehicle.p_ned_m[0] == pytest.approx(GapParameters().stand_off_m, abs=0.3)
 
 
-def test_nothing_is_flown_at_before_the_pilot_engages():
-    course = Course(seen_from_afar)
+def test_before_the_mission_engages_it_stays_in_the_approach():
+    course = Course(visible_until_near)
     for _ in range(20):
         course.step(engaged=False)
     assert set(course.phases) == {Phase.APPROACH}
 
 
-def test_an_opening_lost_at_the_start_of_the_run_breaks_it_off():
-    course = Course(lambda range_m: seen_from_afar(range_m) if range_m > 3.6 else [], speed_m_s=0.8)
+def test_an_opening_lost_at_the_start_of_the_run_aborts_it():
+    course = Course(lambda range_m: visible_until_near(range_m) if range_m > 3.6 else [], speed_m_s=0.8)
     course.fly(14.0)
     assert Phase.RUN in course.phases
     after = course.phases[course.phases.index(Phase.RUN) :]
@@ -184,7 +184,7 @@ def test_an_opening_lost_at_the_start_of_the_run_breaks_it_off():
     assert course.vehicle.p_ned_m[0] < WALL_M
 
 
-def test_an_opening_forgotten_while_the_eyes_close_is_measured_anew():
+def test_an_opening_lost_while_the_baseline_shrinks_is_measured_again():
     hidden = []
 
     def show(range_m):
@@ -192,7 +192,7 @@ def test_an_opening_forgotten_while_the_eyes_close_is_measured_anew():
         if (closing or hidden) and len(hidden) < 15:
             hidden.append(range_m)
             return []
-        return seen_from_afar(range_m)
+        return visible_until_near(range_m)
 
     course = Course(lambda range_m: [])
     course.show = show
@@ -203,25 +203,25 @@ def test_an_opening_forgotten_while_the_eyes_close_is_measured_anew():
     assert last.intent is Intent.DONE
 
 
-def test_an_opening_that_is_cut_is_not_chosen():
-    course = Course(lambda range_m: seen_from_afar(range_m, cut=True), look_s=3.0)
+def test_an_opening_cut_by_the_image_is_not_chosen():
+    course = Course(lambda range_m: visible_until_near(range_m, cut=True), look_s=3.0)
     assert course.fly(10.0).intent is Intent.REFUSE
 
 
 @pytest.mark.parametrize(("room_m", "intent"), [(0.04, Intent.DONE), (-0.02, Intent.REFUSE)])
-def test_an_opening_that_is_followed_may_leave_the_view_in_part_while_it_fits_through_the_rest(room_m, intent):
+def test_a_followed_opening_may_be_cut_while_the_vehicle_fits(room_m, intent):
     def show(range_m):
         near = range_m < 5.5
-        return seen_from_afar(range_m, cut=near, room_m=room_m if near else 0.04)
+        return visible_until_near(range_m, cut=near, room_m=room_m if near else 0.04)
 
     assert Course(show, look_s=3.0).fly(30.0).intent is intent
 
 
-def test_an_opening_forgotten_is_not_taken_up_again_from_a_part_of_it():
+def test_a_cut_opening_is_not_chosen_again_after_a_loss():
     def show(range_m):
         away = course.now_ns > 13 * S
         gone = away and course.now_ns < 16 * S
-        return [] if gone else seen_from_afar(range_m, cut=away)
+        return [] if gone else visible_until_near(range_m, cut=away)
 
     course = Course(lambda range_m: [], look_s=3.0)
     course.show = show

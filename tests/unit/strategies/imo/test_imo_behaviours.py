@@ -1,4 +1,4 @@
-"""Observe, pursue, dodge: what the mission wants of the vehicle, and of its baseline."""
+"""Observe, pursue, dodge: velocity, heading and baseline that the moving-object mission commands."""
 
 import math
 from dataclasses import replace
@@ -13,48 +13,48 @@ from morpheyes_daemon.strategies.imo.behaviours import (
     Dodge,
     ObjectState,
     Pursue,
-    encounter,
+    closest_approach,
+    evasion_direction,
     pursuit_velocity,
-    way_out,
 )
 from morpheyes_daemon.strategies.imo.strategy import Imo, ImoParameters, ImoPercept
 from tests.support.seen_from_above import CRAFT, SUMMARY, empty_profile
 
 
-def thing(p: tuple[float, float, float], v: tuple[float, float, float], sigma: float = 0.0) -> ObjectState:
+def moving(p: tuple[float, float, float], v: tuple[float, float, float], sigma: float = 0.0) -> ObjectState:
     return ObjectState(np.array(p), np.array(v), np.eye(6) * sigma**2, 0.2)
 
 
-def test_pursuit_keeps_the_distance_and_goes_along_with_the_object() -> None:
+def test_pursuit_keeps_the_distance_and_matches_the_objects_speed() -> None:
     pursue = Pursue(kind="pursue", distance_m=3.0)
     origin = np.zeros(3)
-    assert np.allclose(pursuit_velocity(thing((3.0, 0, 0), (0, 0, 0)), origin, pursue), 0.0)
-    assert np.allclose(pursuit_velocity(thing((3.0, 0, 0), (0.7, 0, 0)), origin, pursue), (0.7, 0.0))
-    assert pursuit_velocity(thing((5.0, 0, 0), (0, 0, 0)), origin, pursue)[0] == pytest.approx(0.8 * 2.0)
-    assert pursuit_velocity(thing((2.0, 0, 0), (0, 0, 0)), origin, pursue)[0] < 0.0
-    # across the line of sight the vehicle turns and does not fly
-    assert np.allclose(pursuit_velocity(thing((3.0, 0, 0), (0, 1.0, 0)), origin, pursue), 0.0)
+    assert np.allclose(pursuit_velocity(moving((3.0, 0, 0), (0, 0, 0)), origin, pursue), 0.0)
+    assert np.allclose(pursuit_velocity(moving((3.0, 0, 0), (0.7, 0, 0)), origin, pursue), (0.7, 0.0))
+    assert pursuit_velocity(moving((5.0, 0, 0), (0, 0, 0)), origin, pursue)[0] == pytest.approx(0.8 * 2.0)
+    assert pursuit_velocity(moving((2.0, 0, 0), (0, 0, 0)), origin, pursue)[0] < 0.0
+    # across the line of sight the vehicle yaws and does not move
+    assert np.allclose(pursuit_velocity(moving((3.0, 0, 0), (0, 1.0, 0)), origin, pursue), 0.0)
 
 
-def test_an_encounter_is_the_nearest_passage() -> None:
-    passing = encounter(thing((4.0, 0.3, 0), (-1.0, 0.0, 0)), np.zeros(3), 10.0)
-    assert passing is not None
-    assert passing.in_s == pytest.approx(4.0)
-    assert passing.distance_m == pytest.approx(0.3)
-    assert encounter(thing((4.0, 0.0, 0), (1.0, 0, 0)), np.zeros(3), 10.0) is None
+def test_the_closest_approach_has_its_time_and_distance() -> None:
+    approach = closest_approach(moving((4.0, 0.3, 0), (-1.0, 0.0, 0)), np.zeros(3), 10.0)
+    assert approach is not None
+    assert approach.in_s == pytest.approx(4.0)
+    assert approach.distance_m == pytest.approx(0.3)
+    assert closest_approach(moving((4.0, 0.0, 0), (1.0, 0, 0)), np.zeros(3), 10.0) is None
 
 
 def test_the_spread_of_a_predicted_path_grows_with_time() -> None:
-    sure = thing((4.0, 0.0, 0), (-1.0, 0, 0), sigma=0.1)
+    sure = moving((4.0, 0.0, 0), (-1.0, 0, 0), sigma=0.1)
     # position and velocity, 0.1 each, four seconds ahead
     assert sure.spread_m(4.0) == pytest.approx(math.hypot(0.1, 0.4))
 
 
-def test_the_way_out_is_across_the_path_and_away_from_it() -> None:
-    coming = thing((4.0, 0.2, 0), (-1.0, 0.0, 0))
-    passing = encounter(coming, np.zeros(3), 10.0)
-    assert passing is not None
-    out = way_out(passing, coming)
+def test_evasion_is_across_the_path_and_away_from_it() -> None:
+    approaching = moving((4.0, 0.2, 0), (-1.0, 0.0, 0))
+    approach = closest_approach(approaching, np.zeros(3), 10.0)
+    assert approach is not None
+    out = evasion_direction(approach, approaching)
     assert np.allclose(out, (0.0, -1.0))  # it passes east of us, so west
 
 
@@ -80,14 +80,14 @@ def test_the_baseline_follows_the_median_depth_and_stays_when_the_object_is_lost
     assert decide(imo, track((16.0, 0, -1.5), (0, 0, 0), 15.0)).baseline_m == 0.3
 
 
-def test_it_turns_to_an_object_at_the_edge_and_holds_still_for_one_in_the_middle() -> None:
+def test_it_yaws_only_when_the_object_is_off_the_centre() -> None:
     imo = mission()
     decide(imo, None, engaged=False)
     assert decide(imo, track((5.0, 0.2, -1.5), (0, 0, 0), 5.0)).yaw_rad == pytest.approx(0.0)
     assert decide(imo, track((5.0, 1.5, -1.5), (0, 0, 0), 5.0)).yaw_rad == pytest.approx(math.atan2(1.5, 4.91), abs=0.01)
 
 
-def test_observing_stays_and_ends_after_its_time() -> None:
+def test_observing_stays_and_ends_after_its_duration() -> None:
     imo = mission(duration_s=5.0)
     decide(imo, None, 9.0, engaged=False)
     watching = decide(imo, track((5.0, 0, -1.5), (1.0, 0, 0), 5.0), 10.0)
@@ -96,17 +96,17 @@ def test_observing_stays_and_ends_after_its_time() -> None:
     assert decide(imo, None, 14.5).intent is Intent.DONE
 
 
-def test_pursuit_flies_no_further_than_what_is_seen_to_be_free() -> None:
+def test_pursuit_is_bounded_by_visible_free_space() -> None:
     imo = mission(behaviour={"kind": "pursue", "distance_m": 2.0})
     decide(imo, None, 9.0, engaged=False)
     seen = decide(imo, track((6.0, 0, -1.5), (0, 0, 0), 5.9))
     assert seen.v_ned_m_s[0] > 0.5
     assert seen.clear_m > 5.0
-    # backwards nobody looks
+    # the camera does not see backwards
     assert decide(imo, track((1.2, 0, -1.5), (-0.5, 0, 0), 1.1)).clear_m == 0.0
 
 
-def test_dodging_steps_aside_within_the_room_that_is_vouched_for_and_comes_back() -> None:
+def test_dodging_stays_within_the_declared_free_radius() -> None:
     imo = mission(behaviour=Dodge(kind="dodge").model_dump(), free_radius_m=2.0)
     decide(imo, None, 9.0, engaged=False)
     coming = track((3.0, 0.05, -1.5), (-1.0, 0.0, 0.0), 2.9)

@@ -28,7 +28,9 @@ coordinate = st.floats(-8.0, 8.0)
 
 
 @given(st.lists(st.tuples(coordinate, coordinate), max_size=8), st.floats(-3.1, 3.1), st.floats(0.2, 1.0))
-def test_it_is_as_far_as_a_disc_can_be_pushed(places: list[tuple[float, float]], heading: float, width: float) -> None:
+def test_the_free_distance_is_that_of_a_pushed_disc(
+    places: list[tuple[float, float]], heading: float, width: float
+) -> None:
     points = np.array(places, dtype=np.float64).reshape(-1, 2)
     free = float(free_distance_m(points, np.array([heading]), width, 6.0)[0])
     # one step of the reference, and a step more where the disc just grazes a point
@@ -36,6 +38,6 @@ def test_it_is_as_far_as_a_disc_can_be_pushed(places: list[tuple[float, float]],
     assert walked(points, heading, width - 1e-3, 6.0) >= free - 2 * STEP_M
 
 
-def test_a_point_behind_blocks_nothing() -> None:
+def test_a_point_behind_blocks_no_heading() -> None:
     assert free_distance_m(np.array([[-0.1, 0.0]]), np.array([0.0]), 0.5, 4.0)[0] == 4.0
     assert free_distance_m(np.array([[-0.1, 0.0]]), np.array([math.pi]), 0.5, 4.0)[0] == 0.0

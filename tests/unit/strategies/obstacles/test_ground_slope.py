@@ -1,4 +1,4 @@
-"""The rise of the ground as the forest strategy sees it, past trunks and bushes, and level ground as level."""
+"""The ground slope is fitted past trunks and bushes, and level ground is level."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from morpheyes_daemon.strategies.obstacles.ground_slope import ground_rise
+from morpheyes_daemon.strategies.obstacles.ground_slope import ground_slope
 
 HEIGHT_M = 1.5
 
@@ -27,23 +27,23 @@ def seen(rise_north: float, rise_east: float, offset_m: float = 0.0, seed: int =
 
 @pytest.mark.parametrize(("north", "east"), [(0.12, 0.0), (-0.15, 0.05), (0.0, 0.2), (0.25, -0.1)])
 def test_a_slope_is_found_behind_trunks(north: float, east: float) -> None:
-    found = ground_rise(seen(north, east), HEIGHT_M)
+    found = ground_slope(seen(north, east), HEIGHT_M)
     assert found == pytest.approx((north, east), abs=0.03)
 
 
 def test_a_rangefinder_over_a_bush_does_not_tilt_the_ground() -> None:
-    assert ground_rise(seen(0.0, 0.0), HEIGHT_M - 0.8) == (0.0, 0.0)
-    assert ground_rise(seen(0.15, 0.0), HEIGHT_M - 0.8) == pytest.approx((0.15, 0.0), abs=0.03)
+    assert ground_slope(seen(0.0, 0.0), HEIGHT_M - 0.8) == (0.0, 0.0)
+    assert ground_slope(seen(0.15, 0.0), HEIGHT_M - 0.8) == pytest.approx((0.15, 0.0), abs=0.03)
 
 
-def test_level_ground_is_level_and_little_seen_counts_as_level() -> None:
-    assert ground_rise(seen(0.0, 0.0), HEIGHT_M) == (0.0, 0.0)
-    assert ground_rise(seen(0.2, 0.0)[:, :20], HEIGHT_M) == (0.0, 0.0)
-    assert ground_rise(np.empty((3, 0)), HEIGHT_M) == (0.0, 0.0)
+def test_level_ground_and_too_few_points_give_no_slope() -> None:
+    assert ground_slope(seen(0.0, 0.0), HEIGHT_M) == (0.0, 0.0)
+    assert ground_slope(seen(0.2, 0.0)[:, :20], HEIGHT_M) == (0.0, 0.0)
+    assert ground_slope(np.empty((3, 0)), HEIGHT_M) == (0.0, 0.0)
 
 
 def test_a_wall_is_no_ground() -> None:
     rng = np.random.default_rng(1)
     azimuth, down = rng.uniform(-0.5, 0.5, 4000), rng.uniform(-1.5, 1.5, 4000)
     wall = np.stack([np.full(4000, 5.0), 5.0 * np.tan(azimuth), down])
-    assert math.hypot(*ground_rise(wall, HEIGHT_M)) < 0.1
+    assert math.hypot(*ground_slope(wall, HEIGHT_M)) < 0.1

@@ -1,15 +1,15 @@
-"""Between two commands the vehicle is brought back to its line, and along it as fast as was asked."""
+"""Path following: between two commands the vehicle is kept to its line, at the commanded velocity along it."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from morpheyes_daemon.control.path_following import (
-    ANSWER_S,
     CLIMB_GAIN_1_S,
-    CLIMB_MOST_M_S,
     LEAN_LAG_S,
-    MISSED_MOST_M_S,
+    LOOKAHEAD_S,
+    MAX_CLIMB_M_S,
+    MAX_INTEGRAL_M_S,
     PathFollower,
 )
 from morpheyes_daemon.messages.core import Intent, Line, MissionCommand, VehicleState
@@ -28,57 +28,57 @@ def wanted_velocity(order, vehicle, now_ns):
     return PathFollower().wanted_velocity(order, vehicle, now_ns)
 
 
-def test_without_a_line_the_command_stands():
+def test_without_a_line_the_commands_velocity_is_returned():
     assert wanted_velocity(command(None), VehicleState(), 0) == (3.0, 0.0, 0.0)
 
 
-def test_beside_the_line_it_goes_back_and_keeps_its_speed_along():
+def test_an_offset_is_corrected_across_the_line_only():
     vehicle = VehicleState(p_ned_m=(1.0, 0.2, -1.5))
     v = wanted_velocity(command(Line(0, (7.0, 0.0, -1.4), gain_1_s=2.0)), vehicle, 0)
     assert v == pytest.approx((3.0, -0.4, 0.2))
 
 
-def test_a_point_is_held_when_no_speed_is_asked():
+def test_a_point_is_held_at_zero_velocity():
     vehicle = VehicleState(p_ned_m=(1.0, 0.5, -1.5))
     v = wanted_velocity(command(Line(0, (2.0, 0.5, -1.5), gain_1_s=0.5), (0.0, 0.0, 0.0)), vehicle, 0)
     assert v == pytest.approx((0.5, 0.0, 0.0))
 
 
-def test_a_moving_line_is_led_by_the_lag_of_the_lean():
+def test_a_moving_line_is_predicted_by_the_lag_of_the_lean():
     line = Line(0, (7.0, 0.0, -1.5), (0.0, 0.4, 0.0), (0.0, 0.2, 0.0), gain_1_s=1.0)
     moving = 0.4 + 0.2 * (1.0 + LEAN_LAG_S)
     vehicle = VehicleState(p_ned_m=(0.0, 0.4 + 0.1, -1.5), v_ned_m_s=(3.0, moving, 0.0))
     assert wanted_velocity(command(line), vehicle, S)[1] == pytest.approx(moving)
 
 
-def test_on_its_way_back_it_is_held_against_where_it_will_be():
+def test_the_error_is_taken_at_the_predicted_position():
     line, back = Line(0, (7.0, 0.0, -1.5), gain_1_s=2.0), (3.0, -0.3, 0.0)
     vehicle = VehicleState(p_ned_m=(1.0, 0.2, -1.5), v_ned_m_s=back)
-    assert wanted_velocity(command(line), vehicle, 0)[1] == pytest.approx(-2.0 * (0.2 - 0.3 * ANSWER_S))
+    assert wanted_velocity(command(line), vehicle, 0)[1] == pytest.approx(-2.0 * (0.2 - 0.3 * LOOKAHEAD_S))
 
 
-def test_a_quick_line_is_climbed_to_no_quicker_than_climbing_answers():
+def test_the_vertical_gain_is_bounded():
     line, vehicle = Line(0, (7.0, 0.0, -1.5), gain_1_s=2 * CLIMB_GAIN_1_S), VehicleState(p_ned_m=(1.0, 0.0, -1.4))
     assert wanted_velocity(command(line), vehicle, 0)[2] == pytest.approx(-0.1 * CLIMB_GAIN_1_S)
 
 
-def test_what_stays_missing_is_asked_for_more_and_more():
-    keeper, vehicle = PathFollower(), VehicleState(p_ned_m=(1.0, 0.05, -1.5))
+def test_a_steady_error_is_integrated_up_to_a_bound():
+    follower, vehicle = PathFollower(), VehicleState(p_ned_m=(1.0, 0.05, -1.5))
     order = command(Line(0, (7.0, 0.0, -1.5), gain_1_s=2.0, integral_1_s2=3.0))
-    first, *_, last = (keeper.wanted_velocity(order, vehicle, k * S // 50)[1] for k in range(1, 51))
+    first, *_, last = (follower.wanted_velocity(order, vehicle, k * S // 50)[1] for k in range(1, 51))
     assert first == pytest.approx(-0.1)
     assert last == pytest.approx(-0.1 - 3.0 * 0.05 * 49 / 50)
     for k in range(51, 1000):
-        last = keeper.wanted_velocity(order, vehicle, k * S // 50)[1]
-    assert last == pytest.approx(-0.1 - MISSED_MOST_M_S)
-    keeper.reset()
-    assert keeper.wanted_velocity(order, vehicle, 1000 * S // 50)[1] == pytest.approx(-0.1)
+        last = follower.wanted_velocity(order, vehicle, k * S // 50)[1]
+    assert last == pytest.approx(-0.1 - MAX_INTEGRAL_M_S)
+    follower.reset()
+    assert follower.wanted_velocity(order, vehicle, 1000 * S // 50)[1] == pytest.approx(-0.1)
 
 
 @given(st.tuples(*[st.floats(-50, 50)] * 3), st.tuples(*[st.floats(-50, 50)] * 3), st.floats(0.1, 3.0))
-def test_the_way_back_is_bounded(place, here, most):
-    line = Line(0, place, gain_1_s=2.0, most_m_s=most)
+def test_the_correction_is_bounded(place, here, most):
+    line = Line(0, place, gain_1_s=2.0, max_m_s=most)
     vn, ve, vd = wanted_velocity(command(line), VehicleState(p_ned_m=here), 0)
     assert vn == pytest.approx(3.0)
     assert abs(ve) <= most + 1e-9
-    assert abs(vd) <= CLIMB_MOST_M_S + 1e-9
+    assert abs(vd) <= MAX_CLIMB_M_S + 1e-9
