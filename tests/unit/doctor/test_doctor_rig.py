@@ -114,6 +114,18 @@ async def test_swapped_eyes_do_not_match(tmp_path: Path) -> None:
     assert (finding.id, finding.severity) == ("eyes-do-not-match", Severity.STOP)
 
 
+async def test_rows_that_do_not_agree(tmp_path: Path) -> None:
+    """Guards swapped intrinsics: principal points exchanged in the file shift the rows, and most pixels still match."""
+
+    def shifted(seq: int) -> tuple[Image, Image]:
+        left, right = view(seq)
+        return left, np.roll(right, 2, axis=0)
+
+    [finding] = await look(Camera(shifted), config(tmp_path))
+    assert (finding.id, finding.severity) == ("eyes-do-not-match", Severity.STOP)
+    assert "rows of matched points are 2.0 px apart" in finding.evidence
+
+
 async def test_frozen_dark_and_burnt_images(tmp_path: Path) -> None:
     def dark_and_burnt(seq: int) -> tuple[Image, Image]:
         return np.full((HEIGHT, WIDTH), seq % 5, np.uint8), np.full((HEIGHT, WIDTH), 255, np.uint8)
