@@ -46,6 +46,9 @@ class CameraBase(Section):
     width_px: int = Field(640, ge=160, le=4096)
     height_px: int = Field(480, ge=120, le=3072)
     rate_hz: float = Field(5.0, gt=0.1, le=120, description="stereo pairs per second")
+    h_fov_deg: float | None = Field(
+        None, ge=20, le=140, description="horizontal field of view by the lens's data sheet; the doctor compares"
+    )
     sync_error_ms: float = Field(2.0, ge=0, le=100, description="largest time between the eyes, measured")
     mount: Mount = Mount()
 

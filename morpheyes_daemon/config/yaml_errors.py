@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from morpheyes_daemon.config.yaml_reader import parse_yaml, read_text
 from morpheyes_daemon.errors import ConfigError
+
+__all__ = ["line_of", "load_model", "parse_model", "parse_yaml", "read_text", "validate"]
+
+MOST_SENTENCES = 20
+LONGEST_KEY = 80
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -19,40 +26,25 @@ def load_model(path: Path, model: type[M]) -> M:
     return parse_model(text, model, str(path))
 
 
-def read_text(path: Path) -> str:
-    """Read a text file; raises ConfigError with a sentence."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: there is no such file.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as text ({error}).") from None
-
-
 def parse_model(text: str, model: type[M], name: str) -> M:
     """Check YAML `text` against `model`; `name` stands for the file in errors."""
     data, root = parse_yaml(text, name)
     return validate(data, model, name, root)
 
 
-def parse_yaml(text: str, name: str) -> tuple[Any, yaml.Node | None]:
-    """Return the plain data and the node tree (for line numbers) of one YAML document."""
-    try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"{name}:{mark.line + 1}" if mark else name
-        raise ConfigError(f"{where}: not valid YAML: {getattr(error, 'problem', None) or error}.") from None
-    return ({} if data is None else data), root
-
-
 def validate(data: Any, model: type[M], name: str, root: yaml.Node | None) -> M:
-    """Build `model` from `data`; every violation becomes one line of the ConfigError."""
+    """Build `model` from `data`; every violation becomes one line of the ConfigError, up to MOST_SENTENCES.
+
+    Strict: neither a boolean nor a text is taken for a number. It goes through JSON, since pydantic's strictness is
+    then about what a file can say: a list may still be a tuple, a word an enum or a path.
+    """
     try:
-        return model.model_validate(data)
+        return model.model_validate_json(json.dumps(data, default=str), strict=True)
     except ValidationError as error:
-        lines = [_sentence(dict(problem), name, root) for problem in error.errors()]
+        problems = error.errors()
+        lines = [_sentence(dict(problem), name, root) for problem in problems[:MOST_SENTENCES]]
+        if len(problems) > MOST_SENTENCES:
+            lines.append(f"{name}: and {len(problems) - MOST_SENTENCES} more of the kind.")
         raise ConfigError("\n".join(lines)) from None
 
 
@@ -60,11 +52,11 @@ def _sentence(problem: dict[str, Any], name: str, root: yaml.Node | None) -> str
     location = [str(part) for part in problem["loc"]]
     keys, line = _find(location, root) if root is not None else (location, None)
     where = f"{name}:{line}" if line else name
-    key = ".".join(keys) or "the file"
+    key = _shortened(".".join(keys)) or "the file"
     if problem["type"] == "extra_forbidden":
         return f"{where}: {key}: there is no such key."
     if problem["type"] == "missing":
-        return f"{where}: {'.'.join(location)}: is missing."
+        return f"{where}: {_shortened('.'.join(location))}: is missing."
     allowed = problem["msg"].removeprefix("Value error, ")
     allowed = allowed[0].lower() + allowed[1:]
     if problem["type"] == "value_error" and isinstance(problem.get("input"), dict):
@@ -72,6 +64,10 @@ def _sentence(problem: dict[str, Any], name: str, root: yaml.Node | None) -> str
     found = repr(problem.get("input"))
     found = found if len(found) < 60 else found[:57] + "..."
     return f"{where}: {key}: found {found}; {allowed}."
+
+
+def _shortened(key: str) -> str:
+    return key if len(key) <= LONGEST_KEY else key[:LONGEST_KEY] + "..."
 
 
 def line_of(root: yaml.Node | None, *keys: str) -> int | None:

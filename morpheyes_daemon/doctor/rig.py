@@ -14,11 +14,13 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.devices.camera import Camera
 from morpheyes_daemon.devices.servo import Servo
+from morpheyes_daemon.doctor.calibration_plausibility import implausible
 from morpheyes_daemon.doctor.findings import Finding, Severity
 from morpheyes_daemon.errors import CalibrationError, ConfigError, DeviceError, InputError, MorphEyesError
 from morpheyes_daemon.messages.core import BaselineEstimate, RawPair, StereoFrame
 from morpheyes_daemon.perception.craft import fitting_rig
-from morpheyes_daemon.stereo.depth import DepthEstimator
+from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
+from morpheyes_daemon.stereo.epipolar import row_offsets
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.theory.sync import sync_speed_bound_m_s
 
@@ -28,6 +30,9 @@ SLOW_SHARE = 0.8
 DARK, BURNT = 12.0, 243.0
 """Median grey levels beyond which matching has nothing to work on."""
 FEWEST_MATCHES = 0.25
+MOST_SAID = 3
+ROWS_APART_PX, FEWEST_ROWS = 1.0, 60
+"""Median row offset of matched points beyond which `calibrate check` says "do not fly" as well."""
 SYNC_NEAR_M = 1.0
 SYNC_SPEED_M_S = 0.3
 """The governor flies as slowly past obstacles at SYNC_NEAR_M as the time between the eyes asks for."""
@@ -41,12 +46,18 @@ def examine_calibration(config: VehicleConfig) -> tuple[list[Finding], RigModel 
         rig = fitting_rig(config.calibration, config)
     except (CalibrationError, ConfigError) as error:
         return [_unusable(str(error))], None
-    return examine_rig(rig, config), rig.rescaled(config.camera.width_px, config.camera.height_px)
+    findings = examine_rig(rig, config)
+    usable = all(finding.id != "calibration-implausible" for finding in findings)
+    return findings, rig.rescaled(config.camera.width_px, config.camera.height_px) if usable else None
 
 
 def examine_rig(rig: RigModel, config: VehicleConfig) -> list[Finding]:
     """Return the findings on a calibrated rig that fits the vehicle."""
-    return [*_calibration_verdict(rig, config), *_mount(rig, config), *_sync(rig, config)]
+    scaled = rig.rescaled(config.camera.width_px, config.camera.height_px)
+    unlikely = implausible(scaled, config)
+    if unlikely:
+        return [_implausible(config, unlikely)]
+    return [*_calibration_verdict(scaled, config), *_mount(scaled, config), *_sync(scaled, config)]
 
 
 def _unusable(evidence: str) -> Finding:
@@ -56,6 +67,17 @@ def _unusable(evidence: str) -> Finding:
         evidence,
         "no depth can be computed",
         "calibrate the rig with `morpheyes calibrate` and name the file in config.yaml",
+    )
+
+
+def _implausible(config: VehicleConfig, unlikely: list[str]) -> Finding:
+    more = f" and {len(unlikely) - MOST_SAID} more" if len(unlikely) > MOST_SAID else ""
+    return Finding(
+        "calibration-implausible",
+        Severity.STOP,
+        f"{config.calibration}: {'; '.join(unlikely[:MOST_SAID])}{more}",
+        "depth and direction would be wrong without anything to show it",
+        "fetch the file that `morpheyes calibrate solve` wrote for this rig, or calibrate again",
     )
 
 
@@ -185,20 +207,21 @@ def _match(pair: RawPair, config: VehicleConfig, rig: RigModel) -> list[Finding]
     size = (config.camera.width_px, config.camera.height_px)
     baseline_m = config.baseline_range_m[0]
     at = BaselineEstimate(pair.t_ns, baseline_m, baseline_m, 0.0, False)
+    frame = StereoFrame(pair.seq, pair.t_ns, pair.left, pair.right, at)
     try:
-        depth = DepthEstimator(rig, config.stereo, size).estimate(
-            StereoFrame(pair.seq, pair.t_ns, pair.left, pair.right, at)
-        )
+        estimator = DepthEstimator(rig, config.stereo, size)
+        rectified = estimator.rectified(frame)
+        depth = estimator.depth(frame, rectified)
     except MorphEyesError as error:
         return [_camera_finding("images-unusable", Severity.STOP, str(error), "no depth can be computed")]
-    if depth.valid_fraction >= FEWEST_MATCHES:
-        return []
-    evidence = f"only {depth.valid_fraction:.0%} of the pixels find their partner"
-    return [
-        _camera_finding(
-            "eyes-do-not-match", Severity.STOP, evidence, "swapped eyes or another rig's calibration look like this"
-        )
-    ]
+    offsets = row_offsets(rectified.left, rectified.right, disparity_of(depth))
+    evidence = ""
+    if depth.valid_fraction < FEWEST_MATCHES:
+        evidence = f"only {depth.valid_fraction:.0%} of the pixels find their partner"
+    elif offsets.count >= FEWEST_ROWS and offsets.median_px > ROWS_APART_PX:
+        evidence = f"rows of matched points are {offsets.median_px:.1f} px apart"
+    risk = "swapped eyes, a knock, or another rig's calibration look like this"
+    return [_camera_finding("eyes-do-not-match", Severity.STOP, evidence, risk)] if evidence else []
 
 
 def _camera_finding(name: str, severity: Severity, evidence: str, risk: str) -> Finding:

@@ -28,6 +28,8 @@ from morpheyes_daemon.messages.core import Perception, StereoFrame
 from morpheyes_daemon.messages.mission import Observation
 
 LARGEST_LIST = 64
+LARGEST_WHOLE = 2**64
+"""Stamps, counts and numbers of messages are smaller."""
 OMITTED: Mapping[type, frozenset[str]] = {
     StereoFrame: frozenset({"left", "right"}),
     Perception: frozenset({"left_rect", "depth_m"}),
@@ -137,7 +139,7 @@ def from_plain(plain: Any, hint: Any) -> Any:
     """Return the value of type `hint` that `to_plain` made `plain` from; raises RecordingError when it cannot be."""
     try:
         return _typed(plain, hint)
-    except (TypeError, ValueError, KeyError) as error:
+    except (TypeError, ValueError, KeyError, AttributeError, OverflowError, RecursionError) as error:
         raise RecordingError(f"a recorded {getattr(hint, '__name__', hint)} cannot be read back ({error}).") from None
 
 
@@ -165,9 +167,19 @@ def _typed_items(plain: list[Any], arguments: tuple[Any, ...], origin: Any) -> l
 def _typed_scalar(plain: Any, hint: Any) -> Any:
     if hint is float:
         return math.nan if plain is None else float(plain)
+    if hint is int:
+        return _whole(plain)
     if isinstance(hint, type) and issubclass(hint, (Enum, int, str)):
         return hint(plain)
     return _typed_unsaid(plain)
+
+
+def _whole(plain: Any) -> int:
+    """Return a whole number that arithmetic with floats can bear; ValueError for any other."""
+    number = int(plain)
+    if abs(number) > LARGEST_WHOLE:
+        raise ValueError("a number too large")
+    return number
 
 
 def _typed_unsaid(plain: Any) -> Any:

@@ -1,42 +1,34 @@
 """Flight logs read back: as the messages they were made of, also from a file that a power cut left unfinished.
 
-Reads from the front, chunk by chunk, so a missing index does not matter and a damaged chunk costs that chunk alone.
+Reads from the front, chunk by chunk, so a missing index does not matter and a damaged chunk costs that chunk alone;
+`mcap_scan` finds the next one.
 """
 
 from __future__ import annotations
 
 import json
-import struct
+import mmap
+import os
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-import zstandard
-from mcap.exceptions import EndOfFile, InvalidMagic, RecordLengthLimitExceeded, UnsupportedCompressionError
-from mcap.records import Channel, Chunk, Footer, Message, Metadata, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.records import Channel, Message, Metadata, Schema
 
 from morpheyes_daemon.errors import InputError, RecordingError
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.recorder.channels import EVENTS
 from morpheyes_daemon.recorder.encoding import find_type, from_plain
-from morpheyes_daemon.recorder.flight_log import CHUNK_BYTES, HEADER, LIBRARY
+from morpheyes_daemon.recorder.flight_log import CHUNK_BYTES, HEADER, LIBRARY, checked_header, with_checksum
+from morpheyes_daemon.recorder.mcap_scan import ChunkEnd, Damage, looks_like_mcap, scan
+from morpheyes_daemon.recorder.mcap_writer import ChunkedWriter
 from morpheyes_daemon.recorder.series import FlightSeries
 
-LARGEST_RECORD = 64 * 1024 * 1024
-_CUT = (EndOfFile, InvalidMagic, struct.error, RecordLengthLimitExceeded, ValueError)
-_BAD_CHUNK = (*_CUT, CRCValidationError, UnsupportedCompressionError, zstandard.ZstdError, RuntimeError)
+__all__ = ["Damage", "Flight", "Record", "Recovered", "read_flight", "read_header", "recover"]
 
-
-@dataclass(slots=True)
-class Damage:
-    """What was wrong with a log: chunks and messages that could not be unpacked, and whether the end is there."""
-
-    bad_chunks: int = 0
-    bad_messages: int = 0
-    finished: bool = False
+_NOT_UNDERSTOOD = (RecordingError, ValueError, KeyError, TypeError, RecursionError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,70 +69,75 @@ class Flight:
 def read_flight(path: Path) -> Flight:
     """Read a log; raises InputError when it is none. Messages that cannot be understood are counted and left out."""
     flight = Flight(path)
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    with open_log(path) as stream:
-        for record in records(stream, flight.damage):
-            if isinstance(record, Metadata) and record.name == HEADER:
-                flight.header = dict(record.metadata)
-            elif isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message) and record.channel_id in channels:
-                channel = channels[record.channel_id]
-                schema = schemas.get(channel.schema_id)
-                try:
-                    flight.records.append(_record(channel.topic, schema.name if schema else "", record))
-                except (RecordingError, ValueError, KeyError):
-                    flight.damage.bad_messages += 1
+    contents = _Contents()
+    with _opened(path) as data:
+        for record in scan(data, flight.damage, str(path)):
+            message = contents.take(record)
+            if message is None:
+                continue
+            channel, schema_name = message
+            try:
+                flight.records.append(_record(channel.topic, schema_name, record))
+            except _NOT_UNDERSTOOD:
+                flight.damage.bad_messages += 1
+    flight.header = contents.header
     return flight
 
 
 def read_header(path: Path) -> dict[str, str]:
     """Return a log's header alone; raises InputError when the file is no log."""
-    with open_log(path) as stream:
-        for record in records(stream, Damage()):
-            if isinstance(record, Metadata) and record.name == HEADER:
-                return dict(record.metadata)
-    return {}
+    contents = _Contents()
+    with _opened(path) as data:
+        for record in scan(data, Damage(), str(path)):
+            contents.take(record)
+            if contents.header:
+                break
+    return contents.header
 
 
-def open_log(path: Path) -> IO[bytes]:
-    """Open a log for reading; raises InputError with a sentence."""
+class _Contents:
+    """The header, and the schemas and channels met so far."""
+
+    def __init__(self) -> None:
+        self.header: dict[str, str] = {}
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+
+    def take(self, record: Any) -> tuple[Channel, str] | None:
+        """Take note of a record; returns channel and schema name of a message that has a channel, None otherwise."""
+        if isinstance(record, Message):
+            channel = self.channels.get(record.channel_id)
+            if channel is None:
+                return None
+            schema = self.schemas.get(channel.schema_id)
+            return channel, schema.name if schema else ""
+        if isinstance(record, Schema):
+            self.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self.channels[record.id] = record
+        elif isinstance(record, Metadata) and record.name == HEADER and not self.header:
+            self.header = checked_header(record.metadata) or {}
+        return None
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[mmap.mmap]:
+    """Yield the bytes of a log; raises InputError with a sentence."""
     try:
-        stream = path.open("rb")
-        start = stream.read(len(MCAP0_MAGIC))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
-    if start != MCAP0_MAGIC:
-        stream.close()
+        with path.open("rb") as stream:
+            content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if _is_filled(stream.fileno()) else None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error}).") from None
+    if content is None:
         raise InputError(f"{path}: is not a flight log (an MCAP file).")
-    stream.seek(0)
-    return stream
+    with closing(content):
+        if not looks_like_mcap(content):
+            raise InputError(f"{path}: is not a flight log (an MCAP file).")
+        yield content
 
 
-def records(stream: IO[bytes], damage: Damage) -> Iterator[Any]:
-    """Yield the MCAP records of a log as far as they go, noting in `damage` what was not readable."""
-    reader = StreamReader(stream, emit_chunks=True, record_size_limit=LARGEST_RECORD).records
-    while True:
-        try:
-            record = next(reader)
-        except (StopIteration, *_CUT):
-            return
-        if isinstance(record, Chunk):
-            yield from _unpacked(record, damage)
-        else:
-            damage.finished = damage.finished or isinstance(record, Footer)
-            yield record
-
-
-def _unpacked(chunk: Chunk, damage: Damage) -> list[Any]:
-    try:
-        return list(breakup_chunk(chunk, validate_crc=True))
-    except _BAD_CHUNK:
-        damage.bad_chunks += 1
-        return []
+def _is_filled(descriptor: int) -> bool:
+    return os.fstat(descriptor).st_size > 0
 
 
 def _record(topic: str, schema_name: str, message: Message) -> Record:
@@ -167,45 +164,93 @@ def recover(path: Path, out: Path) -> Recovered:
     """Copy every readable message of a log into a new, finished one; raises InputError when nothing can be done."""
     if out.exists():
         raise InputError(f"{out}: is there already; choose another name with --out.")
-    damage, messages, events, times = Damage(), 0, 0, [2**63, 0]
-    with open_log(path) as stream, out.open("wb") as target:
-        writer: Any = Writer(target, CHUNK_BYTES // 2, CompressionType.ZSTD)
-        writer.start(library=LIBRARY)
-        numbers = _Numbers(writer)
-        for record in records(stream, damage):
-            if isinstance(record, Message):
-                topic = numbers.copy_message(record)
-                messages += topic is not None
+    with _opened(path) as data:
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            target = out.open("xb")
+        except OSError as error:
+            raise _unwritable(out, error) from None
+        try:
+            with target:
+                return _copied(scan(data, damage := Damage(), str(path)), ChunkedWriter(target, LIBRARY), damage)
+        except OSError as error:
+            out.unlink()
+            raise _unwritable(out, error) from None
+        except InputError:
+            out.unlink()
+            raise
+
+
+def _unwritable(out: Path, error: OSError) -> InputError:
+    return InputError(f"{out}: cannot be written ({error.strerror}); name another --out.")
+
+
+def _copied(source: Iterator[Any], writer: ChunkedWriter, damage: Damage) -> Recovered:
+    """Copy the records, a chunk for a chunk, so that damage to the copy costs as little as to the log."""
+    messages, events, first_ns, last_ns = 0, 0, 2**64, 0
+    numbers = _Numbers(writer)
+    for record in source:
+        if isinstance(record, Message):
+            topic = numbers.copy_message(record)
+            if topic is not None:
+                messages += 1
                 events += topic == EVENTS
-                times = [min(times[0], record.log_time), max(times[1], record.log_time)]
-            else:
-                numbers.copy(record)
-        writer.finish()
-    return Recovered(messages, events, damage.bad_chunks, max(0, times[1] - times[0]) / 1e9, damage.finished)
+                first_ns, last_ns = min(first_ns, record.log_time), max(last_ns, record.log_time)
+        elif isinstance(record, ChunkEnd):
+            writer.end_chunk()
+        else:
+            numbers.copy(record)
+    numbers.finish()
+    writer.finish()
+    return Recovered(messages, events, damage.bad_chunks, max(0, last_ns - first_ns) / 1e9, damage.finished)
 
 
 class _Numbers:
-    """Schemas and channels get new numbers in the copy; those repeated in a log's summary are copied once."""
+    """Schemas and channels get new numbers in the copy; those repeated in each chunk are the same."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: ChunkedWriter) -> None:
         self._writer = writer
-        self._schemas: dict[int, int] = {0: 0}
-        self._channels: dict[int, tuple[int, str]] = {}
+        self._contents = _Contents()
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._channels: dict[tuple[Any, ...], int] = {}
 
     def copy(self, record: Any) -> None:
-        if isinstance(record, Metadata):
-            self._writer.add_metadata(record.name, record.metadata)
-        elif isinstance(record, Schema) and record.id not in self._schemas:
-            self._schemas[record.id] = self._writer.register_schema(record.name, record.encoding, record.data)
-        elif isinstance(record, Channel) and record.id not in self._channels:
-            schema = self._schemas.get(record.schema_id, 0)
-            number = self._writer.register_channel(record.topic, record.message_encoding, schema, record.metadata)
-            self._channels[record.id] = (number, record.topic)
+        known = self._contents.header
+        self._contents.take(record)
+        if self._contents.header and not known:
+            self._write_header()
+        elif isinstance(record, Metadata) and record.name != HEADER:
+            self._writer.metadata(record.name, record.metadata)
 
     def copy_message(self, message: Message) -> str | None:
         """Return the topic, None when its channel stood in a damaged chunk."""
-        if message.channel_id not in self._channels:
+        found = self._contents.take(message)
+        if found is None:
             return None
-        number, topic = self._channels[message.channel_id]
-        self._writer.add_message(number, message.log_time, message.data, message.publish_time, message.sequence)
-        return topic
+        number = self._number(found[0])
+        if self._writer.chunk_bytes + len(message.data) > CHUNK_BYTES:
+            self._writer.end_chunk()
+        self._writer.message(number, message.log_time, message.publish_time, message.sequence, message.data)
+        return str(found[0].topic)
+
+    def finish(self) -> None:
+        """Write the header once more, as the flight log does."""
+        if self._contents.header:
+            self._write_header()
+
+    def _write_header(self) -> None:
+        self._writer.metadata(HEADER, with_checksum(self._contents.header))
+
+    def _number(self, channel: Channel) -> int:
+        schema = self._contents.schemas.get(channel.schema_id)
+        schema_number = 0
+        if schema is not None:
+            key = (schema.name, schema.encoding, schema.data)
+            if key not in self._schemas:
+                self._schemas[key] = self._writer.schema(*key)
+            schema_number = self._schemas[key]
+        signature = (channel.topic, channel.message_encoding, schema_number, *sorted(channel.metadata.items()))
+        if signature not in self._channels:
+            number = self._writer.channel(channel.topic, channel.message_encoding, schema_number, channel.metadata)
+            self._channels[signature] = number
+        return self._channels[signature]

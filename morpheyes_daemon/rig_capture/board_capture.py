@@ -15,6 +15,7 @@ import yaml
 
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.calibration.targets.capture_guide import CaptureGuide, Hint
+from morpheyes_daemon.config.yaml_reader import parse_yaml, read_text
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import RawPair
 from morpheyes_daemon.rig_capture.rig_session import RigSession
@@ -68,10 +69,10 @@ def note_board(out: Path, board: Board) -> None:
     path = out / "board.yaml"
     try:
         out.mkdir(parents=True, exist_ok=True)
-        known = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else content
+        known = parse_yaml(read_text(path), str(path))[0] if path.is_file() else content
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); name another folder.") from None
-    if {key: known.get(key) for key in content} != content:
+    if not isinstance(known, dict) or {key: known.get(key) for key in content} != content:
         raise InputError(f"{path}: is of another board; name a new folder or give the same board.")
     path.write_text(yaml.safe_dump({**known, **content}, sort_keys=False), encoding="utf-8")
 

@@ -6,11 +6,11 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 
-import yaml
 from pydantic import BaseModel, create_model
 
 from morpheyes_daemon.config.vehicle import MissionFile
-from morpheyes_daemon.config.yaml_errors import line_of, read_text, validate
+from morpheyes_daemon.config.yaml_errors import line_of, validate
+from morpheyes_daemon.config.yaml_reader import compose, read_text
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.strategies.base import Strategy, StrategyParameters
 
@@ -49,7 +49,7 @@ def find_strategy(name: str) -> type[Strategy]:
 
 def check_mission(path: Path, mission: MissionFile) -> MissionFile:
     """Return the mission when its strategy exists and takes its parameters; raises ConfigError naming the line."""
-    root = yaml.compose(read_text(path), Loader=yaml.SafeLoader)
+    root = compose(read_text(path), str(path))
     try:
         kind = find_strategy(mission.strategy)
     except ConfigError as error:

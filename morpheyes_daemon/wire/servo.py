@@ -90,6 +90,8 @@ class Status:
 
 
 Message = SetTarget | Hello | Ack | Welcome | Status
+FROM_TEENSY = (Ack, Welcome, Status)
+"""What only the Teensy sends; anything else that the host receives is an echo of its own."""
 
 _SET, _HELLO, _ACK, _WELCOME, _STATUS = 0x01, 0x02, 0x81, 0x82, 0x83
 _FIELDS = {

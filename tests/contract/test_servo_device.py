@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Coroutine
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pytest
@@ -21,6 +21,7 @@ from morpheyes_daemon.errors import DeviceError, DeviceLostError, DeviceNotFound
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.simulation.servo.teensy import ServoFault, ServoTruth, TeensyTwin
+from morpheyes_daemon.wire import servo as wire
 
 MOTION = ServoMotion()
 
@@ -48,6 +49,7 @@ class Cable:
         self._twin = twin
         self._on_lost: OnLost | None = None
         self._host: MemoryLink | None = None
+        self._device: MemoryLink | None = None
         self.plugged = True
         self.opened = 0
 
@@ -58,8 +60,28 @@ class Cable:
         self._host, device = MemoryLink.pair(0.001)
         self._host.on_bytes, device.on_bytes = on_bytes, self._twin.receive
         self._twin.connect(device.write)
+        self._device = device
         self._on_lost = on_lost
         return self._host
+
+    def echo(self) -> None:
+        """From now on the line returns what the host sends, and the Teensy is dead."""
+        device = self._device
+        assert device is not None
+        self._twin.inject(ServoFault.SILENT)
+        device.on_bytes = device.write
+
+    def renumber(self) -> None:
+        """From now on acknowledgements carry the number of another target."""
+        device, decoder = self._device, wire.Decoder()
+        assert device is not None
+
+        def passed_on(data: bytes) -> None:
+            for message in decoder.feed(data):
+                wrong = isinstance(message, wire.Ack)
+                device.write(wire.encode(replace(message, seq=(message.seq + 1) % 256) if wrong else message))
+
+        self._twin.connect(passed_on)
 
     def pull(self) -> None:
         self.plugged = False
@@ -183,6 +205,61 @@ def test_silence_is_noticed_once_and_recovery_once() -> None:
             assert b.reasons() == [Reason.BASELINE_STALE, Reason.RECOVERED]
             await passes(3.0)
             assert b.truth_mm() == pytest.approx(250, abs=0.8)  # the target goes on being sent
+
+    flies(scene())
+
+
+def test_an_echoing_line_does_not_hide_a_dead_teensy() -> None:
+    """Guards the silence timer: our own frames coming back counted as the Teensy's, and nothing was noticed."""
+
+    async def scene() -> None:
+        async with bench() as b:
+            await b.servo.open()
+            await b.servo.move(0.2)
+            b.cable.echo()
+            await passes(1.6)
+            assert b.reasons() == [Reason.BASELINE_STALE]
+            assert "silent" in b.events[0].text
+            assert "echoes" in b.events[0].text
+            await passes(2.4)
+            with pytest.raises((DeviceLostError, DeviceTimeoutError)):
+                await b.servo.move(0.21)
+            assert b.cable.opened >= 2
+            assert b.reasons() == [Reason.BASELINE_STALE]
+
+    flies(scene())
+
+
+def test_acknowledgements_of_other_targets_do_not_hide_that_ours_is_lost() -> None:
+    """Guards the same timer: STATUS kept it running while no target was ever acknowledged."""
+
+    async def scene() -> None:
+        async with bench() as b:
+            await b.servo.open()
+            await b.servo.move(0.2)
+            b.cable.renumber()
+            await passes(1.6)
+            assert [(event.reason, event.text) for event in b.events] == [
+                (Reason.BASELINE_STALE, "the Teensy does not acknowledge its target")
+            ]
+            with pytest.raises(DeviceTimeoutError):
+                await b.servo.move(0.21)
+            await passes(5.0)
+            assert b.reasons() == [Reason.BASELINE_STALE]
+            assert b.cable.opened == 1
+            b.twin.connect(b.cable._device.write)  # type: ignore[union-attr]
+            await passes(0.5)
+            assert b.reasons() == [Reason.BASELINE_STALE, Reason.RECOVERED]
+
+    flies(scene())
+
+
+def test_an_idle_servo_without_a_target_is_answered_by_its_greeting() -> None:
+    async def scene() -> None:
+        async with bench() as b:
+            await b.servo.open()
+            await passes(10.0)
+            assert b.events == []
 
     flies(scene())
 

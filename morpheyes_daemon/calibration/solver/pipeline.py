@@ -11,8 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from morpheyes_daemon.calibration.solver.acceptance import judge
 from morpheyes_daemon.calibration.solver.cross_validation import held_out, leave_one_out
 from morpheyes_daemon.calibration.solver.plausibility import ScaleCheck, misnamed, scale_check
@@ -23,7 +21,8 @@ from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.calibration.targets.detection import CornerCache, observe
 from morpheyes_daemon.calibration.targets.image_pairs import read_folder
 from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
-from morpheyes_daemon.errors import CalibrationError
+from morpheyes_daemon.config.yaml_reader import parse_yaml, read_text
+from morpheyes_daemon.errors import CalibrationError, ConfigError
 from morpheyes_daemon.stereo.calibration_file import write_calibration
 
 CORNERS_SUFFIX = ".corners.npz"
@@ -68,8 +67,8 @@ def read_board_file(root: Path) -> Mapping[str, Any]:
     if not path.is_file():
         return {}
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        content, _ = parse_yaml(read_text(path), str(path))
+    except ConfigError:
         content = None
     if not isinstance(content, dict):
         raise CalibrationError(f"{path}: cannot be read; write `board: 9x6` and `square_mm: 25` there, or delete it.")

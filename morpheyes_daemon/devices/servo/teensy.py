@@ -3,6 +3,10 @@
 The last target asked for is repeated as long as the servo is open, so that a Teensy that restarted goes there
 again; the caller is told by an event and by the exception of `move`. This module knows nothing of how long a
 motion takes: that is control.baseline.
+
+Two ages are watched. `heard` is the last frame that only a Teensy sends: an echo of our own frames is none. `answered`
+is the last answer to what we keep sending: a Teensy that reports its state and acknowledges something else is as good
+as silent.
 """
 
 from __future__ import annotations
@@ -55,6 +59,8 @@ class SerialServo:
         self._ack: asyncio.Future[wire.Ack] | None = None
         self._welcome: asyncio.Future[wire.Welcome] | None = None
         self._heard_ns = 0
+        self._answered_ns = 0
+        self._echoes = False
         self._trouble: str | None = None
 
     @property
@@ -123,19 +129,26 @@ class SerialServo:
                 failures += 1
 
     def _beat(self, link: Link) -> None:
-        silent_ns = self._clock.now_ns() - self._heard_ns
-        if silent_ns > REOPEN_NS:
-            self._drop_link("it was silent")
+        now_ns = self._clock.now_ns()
+        if now_ns - self._heard_ns > REOPEN_NS:
+            self._drop_link(f"it was silent{self._echo_words()}")
             return
-        if silent_ns > SILENT_NS:
-            self._lost(Reason.BASELINE_STALE, "the Teensy is silent")
+        if now_ns - self._heard_ns > SILENT_NS:
+            self._lost(Reason.BASELINE_STALE, f"the Teensy is silent{self._echo_words()}")
+        elif now_ns - self._answered_ns > SILENT_NS:
+            self._lost(Reason.BASELINE_STALE, "the Teensy does not acknowledge its target")
         link.write(wire.encode(self._target or wire.Hello()))
+
+    def _echo_words(self) -> str:
+        return ", the line echoes what is sent" if self._echoes else ""
 
     async def _connect(self) -> None:
         self._links_opened += 1
+        self._echoes = False
         self._decoder = wire.Decoder()
         link = await self._opener(self._url, self._on_bytes, partial(self._on_lost, self._links_opened))
         self._link, self._heard_ns = link, self._clock.now_ns()
+        self._answered_ns = self._heard_ns
         try:
             self._check(await self._greet(link))
         except (DeviceError, asyncio.CancelledError):
@@ -172,18 +185,29 @@ class SerialServo:
 
     def _on_bytes(self, data: bytes) -> None:
         for message in self._decoder.feed(data):
-            self._heard_ns = self._clock.now_ns()
-            self._on_message(message)
+            if isinstance(message, wire.FROM_TEENSY):
+                self._heard_ns = self._clock.now_ns()
+                self._on_message(message)
+            else:
+                self._echoes = True
 
     def _on_message(self, message: wire.Message) -> None:
         if isinstance(message, wire.Status):
             self._on_status(message)
-        elif isinstance(message, wire.Welcome) and self._welcome is not None and not self._welcome.done():
-            self._welcome.set_result(message)
+        elif isinstance(message, wire.Welcome):
+            if self._target is None:
+                self._on_answer()
+            if self._welcome is not None and not self._welcome.done():
+                self._welcome.set_result(message)
         elif isinstance(message, wire.Ack) and self._target is not None and message.seq == self._target.seq:
             if self._ack is not None and not self._ack.done():
                 self._ack.set_result(message)
-            self._recovered()
+            self._on_answer()
+
+    def _on_answer(self) -> None:
+        """What the keeper repeats was answered: the target by its acknowledgement, Hello before there is one."""
+        self._answered_ns = self._clock.now_ns()
+        self._recovered()
 
     def _on_status(self, status: wire.Status) -> None:
         """A Teensy that restarted stood still meanwhile, even if a repeated target has reached it since."""

@@ -114,6 +114,19 @@ async def test_swapped_eyes_do_not_match(tmp_path: Path) -> None:
     assert (finding.id, finding.severity) == ("eyes-do-not-match", Severity.STOP)
 
 
+async def test_rows_that_do_not_agree(tmp_path: Path) -> None:
+    """Guards swapped intrinsics: exchanged principal points shift the rows, and coarse texture still matches."""
+
+    def shifted(seq: int) -> tuple[Image, Image]:
+        left, right = (cv2.GaussianBlur(eye, (0, 0), 5.0) for eye in view(seq))
+        left, right = ((4.0 * (eye - eye.mean()) + 128).clip(20, 230).astype(np.uint8) for eye in (left, right))
+        return left, np.roll(right, 2, axis=0)
+
+    [finding] = await look(Camera(shifted), config(tmp_path))
+    assert (finding.id, finding.severity) == ("eyes-do-not-match", Severity.STOP)
+    assert "rows of matched points are " in finding.evidence
+
+
 async def test_frozen_dark_and_burnt_images(tmp_path: Path) -> None:
     def dark_and_burnt(seq: int) -> tuple[Image, Image]:
         return np.full((HEIGHT, WIDTH), seq % 5, np.uint8), np.full((HEIGHT, WIDTH), 255, np.uint8)

@@ -1,5 +1,7 @@
 """Map, strips and film show the flight, to scale and in the right colours."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import av
@@ -174,3 +176,29 @@ def test_film_can_be_made_from_a_log(tmp_path: Path) -> None:
 
 def test_film_without_a_single_image_is_closed_without_error(tmp_path: Path) -> None:
     FlightFilm(tmp_path / "none.mp4", Scene(), Footprint()).close()
+
+
+FULL_DISK = """
+import resource, signal, sys
+import subprocess
+import sys
+from pathlib import Path
+import numpy as np
+from morpheyes_daemon.errors import RecordingError
+from morpheyes_daemon.recorder.pictures.video import VideoWriter
+video = VideoWriter(Path(sys.argv[1]))
+for i in range(60):
+    video.add(0.2 * i, np.random.default_rng(i).integers(0, 255, (240, 320, 3), np.uint8))
+for _ in range(2):
+    try:
+        video.close()
+    except RecordingError as error:
+        print(error)
+"""
+
+
+def test_a_film_on_a_full_disk_is_one_sentence() -> None:
+    """Guards `sim --out` on a full disk: FFmpeg's file output ended the process with SIGSEGV."""
+    done = subprocess.run([sys.executable, "-c", FULL_DISK, "/dev/full"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == "/dev/full: the film cannot be written there (No space left on device).\n"

@@ -13,7 +13,7 @@ from morpheyes_daemon.clock import MonotonicClock, S
 from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.messages.core import Event, Sticks
 from morpheyes_daemon.messages.reasons import Reason
-from morpheyes_daemon.recorder.flight_log import CHUNK_BYTES, flight_header, flight_path
+from morpheyes_daemon.recorder.flight_log import CHUNK_BYTES, FlightLog, flight_header, flight_path
 from morpheyes_daemon.recorder.reader import Flight, read_flight
 from morpheyes_daemon.recorder.recorder import QUEUE_LIMIT, Recorder
 from tests.support.hand_clock import HandClock
@@ -145,16 +145,34 @@ def test_a_new_file_is_begun_when_the_old_one_went_with_its_device(tmp_path: Pat
 def test_names_are_the_time_and_the_mission_and_never_taken_twice(tmp_path: Path) -> None:
     path = flight_path(tmp_path, "missions/forest.yaml", 1_777_638_600.0)
     assert path.name == "2026-05-01T12-30-00Z_forest.mcap"
-    path.touch()
     assert flight_path(tmp_path, "forest", 1_777_638_600.0).name == "2026-05-01T12-30-00Z_forest.2.mcap"
 
 
-def test_flights_go_where_systemd_says_unless_the_folder_is_absolute(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_daemons_of_the_same_second_do_not_share_a_log(tmp_path: Path) -> None:
+    """Guards a race: the name was free until the first sync, and both wrote over each other in one file."""
+    logs = [FlightLog(flight_path(tmp_path, "forest", 0.0), {"who": str(i)}) for i in range(3)]
+    for log in logs:
+        log.sync(durable=False)
+    assert len({log.path for log in logs}) == 3
+    for i, log in enumerate(logs):
+        log.close()
+        assert read_flight(log.path).header == {"who": str(i)}
+
+
+def test_a_folder_that_cannot_be_written_still_gets_a_name(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert flight_path(tmp_path / "file", "forest", 0.0).parent == tmp_path / "file"
+
+
+def test_flights_go_where_systemd_says_unless_the_folder_is_absolute(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("LOGS_DIRECTORY", raising=False)
     assert flight_path(Path("flights"), "forest", 0.0).parent == Path("flights")
-    monkeypatch.setenv("LOGS_DIRECTORY", "/var/log/morpheyes")
-    assert flight_path(Path("flights"), "forest", 0.0).parent == Path("/var/log/morpheyes/flights")
-    assert flight_path(Path("/data"), "forest", 0.0).parent == Path("/data")
+    monkeypatch.setenv("LOGS_DIRECTORY", str(tmp_path / "log"))
+    assert flight_path(Path("flights"), "forest", 0.0).parent == tmp_path / "log" / "flights"
+    assert flight_path(tmp_path / "data", "forest", 0.0).parent == tmp_path / "data"
 
 
 def real_time_recorder(topics: Topics, events: EventLog, path: Path) -> Recorder:
