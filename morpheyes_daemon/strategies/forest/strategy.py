@@ -85,6 +85,10 @@ UNSEEN_M = 2.0
 """Where something is taken to stand in a direction of which nothing at all is known."""
 
 
+IN_VIEW_RAD = 1e-6
+"""The goal is in view when clipping to the view leaves its direction as it is, but for rounding and whole turns."""
+
+
 class Phase(StrEnum):
     """What the decider is doing."""
 
@@ -206,7 +210,7 @@ class Forest(Strategy):
             return None
         clipped_goal = _clip(goal_rad, headings)
         z_goal = float(free_distance_m(obstacles, np.array([clipped_goal]), half_width, reach)[0])
-        if z_goal >= distance_m and clipped_goal == goal_rad:
+        if z_goal >= distance_m and abs(wrap_rad(clipped_goal - goal_rad)) < IN_VIEW_RAD:
             self._around.end(observation.now_ns)
         if self._around.side:
             best = self._around.heading(headings, free)
