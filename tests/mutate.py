@@ -72,6 +72,7 @@ def files_of(what: list[str]) -> list[str]:
 
 def run(mutants: list[Mutant], texts: dict[str, str], jobs: int, noticed: Noticed) -> list[Mutant]:
     """Try every mutant not yet noticed, `jobs` at a time, and return the survivors."""
+    _require_sound({mutant.file for mutant in mutants})
     waiting = list(_batches([mutant for mutant in mutants if mutant not in noticed]))
     tried = len(mutants) - sum(len(batch) for batch in waiting)
     running: dict[int, tuple[int, list[Mutant]]] = {}
@@ -86,7 +87,7 @@ def run(mutants: list[Mutant], texts: dict[str, str], jobs: int, noticed: Notice
         with os.fdopen(answers) as lines:
             verdicts = lines.read().split()
         if status or len(verdicts) != len(batch):
-            raise SystemExit(f"The tests of {batch[0].file} fail without any change, or can not be run: mend them first.")
+            raise SystemExit(f"The mutants of {batch[0].file} could not be tried: see above.")
         for mutant, verdict in zip(batch, verdicts, strict=True):
             if verdict == "noticed":
                 noticed.add(mutant)
@@ -96,6 +97,20 @@ def run(mutants: list[Mutant], texts: dict[str, str], jobs: int, noticed: Notice
         tried += len(batch)
         print(f"{tried}/{len(mutants)}", file=sys.stderr)
     return sorted(survivors, key=lambda mutant: (mutant.file, mutant.line))
+
+
+def _require_sound(files: set[str]) -> None:
+    """Run the tests on the files as they are, each set of tests once; ends the program where one fails."""
+    done: set[frozenset[str]] = set()
+    for file in sorted(files):
+        groups = tests_of(ROOT, file)
+        tests = frozenset(test for group in groups for test in group)
+        if tests in done:
+            continue
+        done.add(tests)
+        nursery = Nursery(ROOT, file, "", groups)
+        if nursery.finish(nursery.start(None)):
+            raise SystemExit(f"The tests of {file} fail without any change: mend them first.")
 
 
 def _batches(mutants: list[Mutant]) -> Iterator[list[Mutant]]:
@@ -120,13 +135,9 @@ def _begun(batch: list[Mutant], text: str) -> tuple[int, int]:
         os.close(read)
         nursery = Nursery(ROOT, batch[0].file, text, tests_of(ROOT, batch[0].file))
         nursery.prepare()
-        sound = True
         for mutant in batch:
-            survives = not nursery.finish(nursery.start(mutant))
-            os.write(write, b"survives " if survives else b"noticed ")
-            sound = sound and not survives
-        # one that survives has shown that the tests pass; where none does they are run on the file as it is
-        status = int(sound and nursery.finish(nursery.start(None)))
+            os.write(write, b"noticed " if nursery.finish(nursery.start(mutant)) else b"survives ")
+        status = 0
     finally:
         os._exit(status)
 

@@ -41,7 +41,11 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "return neutral + (away if abs(away) <= reach else int(math.copysign(reach, away)))",
         "LtE to Lt",
     ): "as far as it reaches is where it wants to be",
-    ("safety/monitor.py", "self._vehicle = VehicleState()", "drop assign"): "not before it is heard is every lease fresh",
+    (
+        "safety/monitor.py",
+        "self._vehicle = VehicleState()",
+        "drop assign",
+    ): "not before it is heard is every lease fresh",
     ("safety/monitor.py", "self._latched = False", "drop assign"): _ENTERED,
     ("safety/monitor.py", "self._latched = False", "False to True"): _ENTERED,
     ("safety/monitor.py", "self._flown_ns = 0", "0 plus 1"): "the later of it and engaging counts",
@@ -56,11 +60,19 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
     ("safety/monitor.py", "return", "drop return"): _LEAVING,
     ("safety/monitor.py", "return None", "drop return"): "who returns nothing returns None",
     ("safety/monitor.py", "self._switch.use()", "drop expr"): "out of flight the way back is by the switch off",
-    ("safety/monitor.py", "if self.state is State.BRAKING:", "if True"): "what it fires has no row in the other two states",
+    (
+        "safety/monitor.py",
+        "if self.state is State.BRAKING:",
+        "if True",
+    ): "what it fires has no row in the other two states",
     ("safety/monitor.py", "elif step.after is not State.HOLD:", "if True"): _HOLD,
     ("safety/monitor.py", "elif step.after is not State.HOLD:", "HOLD to PILOT"): _HOLD,
+    (
+        "wire/servo.py",
+        "if code == 0 or len(block) != code - 1 or 0 in block:",
+        "drop term 0",
+    ): "a block of code 0 is empty, and its length is not -1",
 }
-"""(file, line of source, change) -> why no test could notice; each reason excuses one survivor."""
 """(file, line of source, change) -> why no test could notice."""
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from tests.mutation.changes import Mutant, mutated
 
 PACKAGE = "morpheyes_daemon"
-PER_MUTANT_S = 180
+PER_MUTANT_S = 90
 """Seconds of CPU, and with `WALL_FACTOR` of the wall; a mutant that loops or waits for ever has been noticed."""
 WALL_FACTOR = 4
 PYTEST = (
@@ -42,8 +42,6 @@ class Nursery:
 
     def prepare(self) -> None:
         """Import what the tests need and what is independent of the file; call in the nursery's own process."""
-        os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
-        os.chdir(self.root)
         wanted: set[str] = set()
         for test in (test for group in self.groups for test in group):
             for name in _imports(self.root, self.root / test):
@@ -65,6 +63,8 @@ class Nursery:
         """
         pid = os.fork()
         if pid == 0:
+            os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+            os.chdir(self.root)
             resource.setrlimit(resource.RLIMIT_CPU, (PER_MUTANT_S, PER_MUTANT_S))
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.alarm(WALL_FACTOR * PER_MUTANT_S)
@@ -72,7 +72,7 @@ class Nursery:
             try:
                 if mutant is not None:
                     self._put(mutant)
-                status = int(self._tests_fail(silent=mutant is not None))
+                status = int(self._tests_fail())
             finally:
                 os._exit(status)
         return pid
@@ -92,13 +92,12 @@ class Nursery:
 
         importlib.machinery.SourceFileLoader.get_code = get_code  # type: ignore[method-assign,assignment]
 
-    def _tests_fail(self, silent: bool) -> bool:
+    def _tests_fail(self) -> bool:
         import pytest
 
-        if silent:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, 1)
-            os.dup2(nowhere, 2)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
         scratch = f"--basetemp={_scratch(os.getpid())}"
         for group in self.groups:
             if pytest.main([*PYTEST, "--rootdir", str(self.root), scratch, *group]) not in (0, NO_TESTS):

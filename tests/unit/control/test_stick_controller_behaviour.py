@@ -57,7 +57,7 @@ class Flight:
             v_ned_m_s=(plant.v[0], plant.v[1], 0.0), height_m=1.5, height_t_ns=now_ns,
         )  # fmt: skip
 
-    def fly(self, seconds: float, dies_s: float = math.inf) -> "Flight":
+    def fly(self, seconds: float, dies_s: float = math.inf) -> Flight:
         """Fly; after `dies_s` the last sticks are held for a second, then they are neutral."""
         for ms in range(round(seconds * 1000)):
             now_ns = 100 * S + ms * MS

@@ -173,4 +173,6 @@ def test_film_can_be_made_from_a_log(tmp_path: Path) -> None:
 
 
 def test_film_without_a_single_image_is_closed_without_error(tmp_path: Path) -> None:
-    FlightFilm(tmp_path / "none.mp4", Scene(), Footprint()).close()
+    film = FlightFilm(tmp_path / "none.mp4", Scene(), Footprint())
+    film.close()
+    assert not (tmp_path / "none.mp4").exists() or (tmp_path / "none.mp4").stat().st_size < 1000

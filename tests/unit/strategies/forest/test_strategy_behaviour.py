@@ -30,7 +30,9 @@ Places = list[tuple[float, float]]
 class Mission:
     """Engaged on a free view at the first second, then shown a profile every 0.2 s."""
 
-    def __init__(self, start: VehicleState = STILL, engage_on: ObstacleProfile | None = None, **parameters: object) -> None:
+    def __init__(
+        self, start: VehicleState = STILL, engage_on: ObstacleProfile | None = None, **parameters: object
+    ) -> None:
         self.forest = Forest(ForestParameters(**{"goal": FAR, **parameters}), CRAFT)  # type: ignore[arg-type]
         self.t_ns = S
         first = engage_on or profile_at(start)
@@ -70,9 +72,7 @@ def arc(away_m: float, yaw_rad: float = 0.0) -> Places:
 def seen(places: Places, yaw_rad: float = 0.0) -> ObstacleProfile:
     """A profile with these obstacles; only those in view are seen."""
     base = empty_profile(yaw_rad=yaw_rad)
-    inside = [
-        (n, e) for n, e in places if abs((math.atan2(e, n) - yaw_rad + math.pi) % (2 * math.pi) - math.pi) < 0.6
-    ]
+    inside = [(n, e) for n, e in places if abs((math.atan2(e, n) - yaw_rad + math.pi) % (2 * math.pi) - math.pi) < 0.6]
     return with_points(base, inside)
 
 

@@ -182,7 +182,9 @@ def test_what_is_beyond_the_trusted_range_is_kept_out() -> None:
     assert not found.unknown.any(), "it was matched"
 
 
-@pytest.mark.parametrize(("bottoms_m", "tops_m", "counts"), [(0.0, 0.9, False), (2.1, 9.0, False), (0.0, 1.6, True), (1.4, 9.0, True)])
+@pytest.mark.parametrize(
+    ("bottoms_m", "tops_m", "counts"), [(0.0, 0.9, False), (2.1, 9.0, False), (0.0, 1.6, True), (1.4, 9.0, True)]
+)
 def test_only_what_reaches_into_the_band_at_the_vehicles_height_counts(
     bottoms_m: float, tops_m: float, counts: bool
 ) -> None:
@@ -198,7 +200,9 @@ def test_the_band_is_about_the_vehicle_and_not_about_the_camera_or_the_ground(he
         assert bool(np.isfinite(found.range_m[at(found, 0.0)])) == counts
 
 
-@pytest.mark.parametrize(("band_m", "below_m", "counts"), [(0.2, 0.05, 1), (0.2, 0.35, 0), (0.8, 0.4, 1), (0.8, 0.95, 0)])
+@pytest.mark.parametrize(
+    ("band_m", "below_m", "counts"), [(0.2, 0.05, 1), (0.2, 0.35, 0), (0.8, 0.4, 1), (0.8, 0.95, 0)]
+)
 def test_the_band_is_as_wide_as_asked(band_m: float, below_m: float, counts: int) -> None:
     """A stump whose top is so far below the vehicle; less than a fifth of the band is not enough to count."""
     found = profile(view(((4.0, 0.0, 0.3),), tops_m=1.5 - below_m), band_m=band_m)
