@@ -418,3 +418,50 @@ def test_parameters_that_contradict_each_other_are_refused(changes: dict[str, fl
     with pytest.raises(ValueError, match=r"tight_margin_m must not|reach_m must be at least 0\.6 m more"):
         ForestParameters(**changes)  # type: ignore[arg-type]
     assert ForestParameters(tight_margin_m=0.3, margin_m=0.3, reach_m=1.1, safe_m=0.5)
+
+
+def away_and_back(mission: Mission, flown_m: float, start_m: float = 0.0) -> tuple[float, float, float]:
+    """Fly north at 3 m/s past a goal that lies east: way until it stops, the turn it makes, and its rate."""
+    north_m = start_m
+    while True:
+        vehicle = replace(STILL, p_ned_m=(north_m, 0.0, -1.5), v_ned_m_s=(3.0, 0.0, 0.0))
+        command = mission.show(profile_at(vehicle), vehicle)
+        if command.intent is Intent.STOP:
+            break
+        north_m += 0.6
+        assert north_m < start_m + flown_m
+    yaw = 0.0
+    while command.intent is Intent.STOP:
+        assert command.yaw_rad is not None
+        rate = (command.yaw_rad - yaw + math.pi) % (2 * math.pi) - math.pi
+        yaw += rate * 0.2
+        vehicle = replace(STILL, p_ned_m=(north_m, 0.0, -1.5), yaw_rad=yaw)
+        command = mission.show(profile_at(vehicle), vehicle)
+    return north_m - start_m, yaw, rate
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_turning_back_it_stops_turning_when_the_goal_is_well_in_view(side: float) -> None:
+    mission = Mission(goal=Goal(forward_m=0.1, right_m=side * 20.0))
+    flown_m, turned_rad, rate = away_and_back(mission, 30.0)
+    # the goal is abeam at once, and a first detour of 4 m is allowed
+    assert flown_m == pytest.approx(4.0, abs=0.7)
+    assert rate == pytest.approx(side * math.radians(35.0))
+    # from where it stands the goal is 90 degrees and atan(3.9 / 20) off; within half of 75 degrees it has turned enough
+    off_deg = 90.0 + math.degrees(math.atan((flown_m - 0.1) / 20.0))
+    assert math.degrees(abs(turned_rad)) == pytest.approx(off_deg - 37.5, abs=7.1)
+
+
+def test_each_turn_back_that_brings_it_no_nearer_allows_a_detour_twice_as_long() -> None:
+    mission = Mission(goal=Goal(forward_m=0.1, right_m=20.0))
+    first, _, _ = away_and_back(mission, 30.0)
+    second, _, _ = away_and_back(mission, 30.0)
+    assert second == pytest.approx(2.0 * first, abs=1.3)
+    # 1.5 m nearer than ever is not nearer, 3 m are
+    for nearer_m, wanted_m in [(1.5, 16.0), (3.0, 4.0)]:
+        near = replace(STILL, p_ned_m=(0.0, nearer_m, -1.5))
+        again = Mission(goal=Goal(forward_m=0.1, right_m=20.0))
+        away_and_back(again, 30.0)
+        away_and_back(again, 30.0)
+        again.show(profile_at(near), near)
+        assert away_and_back(again, 30.0)[0] == pytest.approx(wanted_m, abs=1.3)
