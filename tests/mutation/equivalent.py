@@ -14,6 +14,8 @@ _LEAVING = "on the way out only RELEASED and PILOT are outside flight, and neith
 _HOLD = "in HOLD nothing that asks for it has a row, and every way out sets it anew"
 _ENTERED = "the first transition sets it, and it is read in flight"
 
+_EQUAL = "differs only where two measured lengths or angles are equal to the last bit"
+
 EQUIVALENT: dict[tuple[str, str, str], str] = {
     ("safety/engage_switch.py", "self._flipped = False", "drop assign"): _UNHEARD,
     ("safety/engage_switch.py", "self._flipped = False", "False to True"): _UNHEARD,
@@ -72,6 +74,26 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "if code == 0 or len(block) != code - 1 or 0 in block:",
         "drop term 0",
     ): "a block of code 0 is empty, and its length is not -1",
+    (
+        "strategies/forest/strategy.py",
+        "if z_close < min(OPEN_SHARE * reach, distance_m, z_free):",
+        "Lt to LtE",
+    ): _EQUAL,
+    (
+        "strategies/forest/strategy.py",
+        "if z_goal >= distance_m and abs(wrap_rad(clipped_goal - goal_rad)) < IN_VIEW_RAD:",
+        "Lt to LtE",
+    ): _EQUAL,
+    (
+        "strategies/forest/strategy.py",
+        "free_rad = float(headings[int(np.argmax(np.where(free >= parameters.safe_m, progress, -np.inf)))])",
+        "GtE to Gt",
+    ): _EQUAL,
+    (
+        "strategies/obstacles/ground_slope.py",
+        "turn = (np.arctan2(east, north) + np.pi) / (2.0 * np.pi) * 6 * SECTORS",
+        "Add to Sub",
+    ): "cells are numbered otherwise, by a whole turn",
 }
 """(file, line of source, change) -> why no test could notice."""
 

@@ -215,3 +215,10 @@ def test_cancelling_ends_every_task() -> None:
 
     run_virtual(live())
     assert ended == ["ended", "ended"]
+
+
+def test_a_new_task_has_no_restarts() -> None:
+    assert Task("camera", Life().run, Reason.CAMERA_LOST).restarts == 0
+    assert Task("camera", Life().run, Reason.CAMERA_LOST).essential is True
+    with pytest.raises(TypeError):
+        Task("camera", Life().run, Reason.CAMERA_LOST, True, restarts=3)  # type: ignore[call-arg]

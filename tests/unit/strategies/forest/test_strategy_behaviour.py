@@ -465,3 +465,12 @@ def test_each_turn_back_that_brings_it_no_nearer_allows_a_detour_twice_as_long()
         away_and_back(again, 30.0)
         again.show(profile_at(near), near)
         assert away_and_back(again, 30.0)[0] == pytest.approx(wanted_m, abs=1.3)
+
+
+def test_exactly_the_detour_is_enough_to_turn_back() -> None:
+    """A metre a step: after four steps it has flown the four metres."""
+    mission = Mission(goal=Goal(forward_m=-20.0))
+    steps = 0
+    while mission.show(empty_profile(), replace(STILL, v_ned_m_s=(2.0, 0.0, 0.0)), dt_s=0.5).intent is Intent.FLY:
+        steps += 1
+    assert steps == 3

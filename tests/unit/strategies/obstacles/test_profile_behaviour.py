@@ -313,3 +313,17 @@ def test_a_larger_image_gives_the_same_profile() -> None:
     found = profile(replace(small, depth=replace(depth, pinhole=large, **twice)))
     wanted = profile(small)
     assert (np.isfinite(found.range_m) == np.isfinite(wanted.range_m)).mean() > 0.95
+
+
+def test_a_shadow_beside_a_trunk_at_the_right_border_lies_behind_it_as_well() -> None:
+    seen = with_depth(view(), slice(158, 160), depth_m=4.0)
+    found = profile(with_depth(seen, slice(140, 158), depth_m=np.nan, half_occluded=True))
+    assert found.behind_m[-4] == found.range_m[-1] < 5.0
+
+
+def test_at_the_right_border_nothing_tells_what_a_shadow_lies_behind() -> None:
+    seen = with_depth(view(((3.0, -0.2, 0.3),)), slice(140, 160), depth_m=np.nan, half_occluded=True)
+    found = profile(seen)
+    assert found.unknown[-1]
+    assert np.isfinite(found.range_m).any()
+    assert np.isnan(found.behind_m).all()
