@@ -63,7 +63,7 @@ class Nursery:
         """
         pid = os.fork()
         if pid == 0:
-            os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+            os.environ |= {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "MUTATING": "1"}
             os.chdir(self.root)
             resource.setrlimit(resource.RLIMIT_CPU, (PER_MUTANT_S, PER_MUTANT_S))
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
