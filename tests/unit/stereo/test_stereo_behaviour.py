@@ -13,6 +13,7 @@ import yaml
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.stereo.calibration_file import calibration_hash, read_calibration, write_calibration
 from morpheyes_daemon.stereo.colours import baseline_bgr, colour_depth
+from morpheyes_daemon.stereo.depth import default_settings
 from morpheyes_daemon.stereo.rig import CameraMount
 from tests.support.panels import crooked_rig
 
@@ -66,3 +67,7 @@ def test_depth_goes_from_warm_to_cold_by_equal_ratios_and_unknown_is_grey() -> N
     assert picture[1, 0].tolist() == near.tolist(), "nearer than the scale is as near"
     assert picture[1, 2].tolist() == far.tolist()
     assert middle[1] > 200, "half way in ratios is green"
+
+
+def test_from_four_hundred_rows_on_they_are_taken_two_by_two() -> None:
+    assert [default_settings(height).row_step for height in (120, 399, 400, 480)] == [1, 1, 2, 2]
