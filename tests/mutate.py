@@ -26,7 +26,7 @@ sys.path.insert(0, str(ROOT))
 
 from tests.mutation.changes import Mutant, enums_in, mutants_of  # noqa: E402
 from tests.mutation.equivalent import reason_of  # noqa: E402
-from tests.mutation.rooms import NOT_TRIED, tests_of  # noqa: E402
+from tests.mutation.rooms import NOT_TRIED, groups_for  # noqa: E402
 from tests.mutation.trial import PACKAGE, Nursery  # noqa: E402
 
 WANTED = {"safety": 0.95}
@@ -66,7 +66,7 @@ def files_of(what: list[str]) -> list[str]:
         files = [path] if path.is_file() else sorted(path.rglob("*.py"))
         relative = [str(file.relative_to(package)) for file in files]
         named_alone = path.is_file()
-        found += [file for file in relative if tests_of(ROOT, file) and (named_alone or file not in NOT_TRIED)]
+        found += [file for file in relative if groups_for(ROOT, file) and (named_alone or file not in NOT_TRIED)]
     return list(dict.fromkeys(found))
 
 
@@ -103,7 +103,7 @@ def _require_sound(files: set[str]) -> None:
     """Run the tests on the files as they are, each set of tests once; ends the program where one fails."""
     done: set[frozenset[str]] = set()
     for file in sorted(files):
-        groups = tests_of(ROOT, file)
+        groups = groups_for(ROOT, file)
         tests = frozenset(test for group in groups for test in group)
         if tests in done:
             continue
@@ -133,7 +133,7 @@ def _begun(batch: list[Mutant], text: str) -> tuple[int, int]:
     status = 1
     try:
         os.close(read)
-        nursery = Nursery(ROOT, batch[0].file, text, tests_of(ROOT, batch[0].file))
+        nursery = Nursery(ROOT, batch[0].file, text, groups_for(ROOT, batch[0].file))
         nursery.prepare()
         for mutant in batch:
             os.write(write, b"noticed " if nursery.finish(nursery.start(mutant)) else b"survives ")

@@ -47,11 +47,11 @@ TESTS: dict[str, tuple[str, ...]] = {
 }
 """File or folder of the package (by prefix) -> the tests that must notice a change of it."""
 
-NOT_TRIED = ("safety/generate_docs.py", "safety/leases.py")
-"""Named alone they are tried: the first writes a page, of the second every row is a row of `safety/gate.py`."""
+NOT_TRIED = ("safety/generate_docs.py",)
+"""Tried when it is named alone: it writes a page that a test compares."""
 
 
-def tests_of(root: Path, file: str) -> list[list[str]]:
+def groups_for(root: Path, file: str) -> list[list[str]]:
     """Return the test files for a source file in three groups: those of its name, those that name it, the rest.
 
     Empty when the table has no row for the file.

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.mutation.changes import enums_in, mutants_of, mutated
-from tests.mutation.rooms import TESTS, tests_of
+from tests.mutation.rooms import TESTS, groups_for
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "morpheyes_daemon"
@@ -61,11 +61,11 @@ def test_every_row_of_the_table_has_code_and_tests() -> None:
     for place in TESTS:
         assert (PACKAGE / place).exists(), place
         file = place if place.endswith(".py") else str(next((PACKAGE / place).rglob("*.py")).relative_to(PACKAGE))
-        assert tests_of(ROOT, file), place
+        assert groups_for(ROOT, file), place
 
 
 def test_the_tests_of_a_files_own_name_come_first() -> None:
-    groups = tests_of(ROOT, "control/governor.py")
+    groups = groups_for(ROOT, "control/governor.py")
     assert groups[0] == ["tests/unit/control/test_governor.py", "tests/unit/control/test_governor_behaviour.py"]
     assert "tests/unit/control/test_stick_controller_behaviour.py" in groups[1]
 
@@ -80,7 +80,7 @@ def tried(*arguments: str) -> dict[str, object]:
 
 
 def test_a_few_mutants_are_tried_and_counted() -> None:
-    found = tried("control/pid.py", "--sample", "3", "--seed", "2")
+    found = tried("errors.py", "--sample", "3", "--seed", "2")
     assert found["tried"] == 3
     assert isinstance(found["survivors"], list)
     assert found["noticed"] == 3 - len(found["survivors"])

@@ -57,9 +57,7 @@ def table() -> StoppingTable:
 
 @pytest.mark.parametrize("speed", [0.0, 0.04, 0.1, 1.23, 2.57, 6.0, 9.95])
 @pytest.mark.parametrize("limit", [1.0, 2.0, 4.0])
-def test_between_its_speeds_the_table_is_near_the_plant(
-    table: StoppingTable, speed: float, limit: float
-) -> None:
+def test_between_its_speeds_the_table_is_near_the_plant(table: StoppingTable, speed: float, limit: float) -> None:
     exact = float(braking_distances_m(np.array([speed]), np.array([limit]), LEAN_RAD, BRAKES[0])[0, 0])
     # alone it is cut off at 2 cm/s, in the table with the fastest one
     assert table.distance_m(speed, limit, 0.0) == pytest.approx(exact, abs=0.015)

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.config.vehicle import (
-    Footprint, Mount, MissionFile, NoServoConfig, SafetyConfig, SimCameraConfig, VehicleConfig,
+    Footprint,
+    MissionFile,
+    Mount,
+    NoServoConfig,
+    SafetyConfig,
+    SimCameraConfig,
+    VehicleConfig,
 )  # fmt: skip
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.messages.core import Pinhole, VehicleState
