@@ -94,6 +94,11 @@ EQUIVALENT: dict[tuple[str, str, str], str] = {
         "turn = (np.arctan2(east, north) + np.pi) / (2.0 * np.pi) * 6 * SECTORS",
         "Add to Sub",
     ): "cells are numbered otherwise, by a whole turn",
+    (
+        "control/baseline.py",
+        "return self._legs[max(0, bisect_right(self._legs, t_ns, key=lambda leg: leg.start_ns) - 1)]",
+        "0 minus 1",
+    ): "before the first leg every leg is still to end, and the place is that of the start",
 }
 """(file, line of source, change) -> why no test could notice."""
 
