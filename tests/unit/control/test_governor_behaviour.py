@@ -199,3 +199,31 @@ def test_the_bounds_are_those_of_the_configuration() -> None:
         dead_daemon_s=1.4, depth_sigmas=2.0, max_relative_depth_error=0.25, max_speed_m_s=3.5,
         sync_error_s=0.003, image_width_px=480, sync_tolerance_px=1.0, standoff_m=0.15,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("dead_s", [0.5, 1.6])
+def test_the_stick_is_held_as_long_as_a_dead_daemon_leaves_it(dead_s: float) -> None:
+    limits = replace(LIMITS, dead_daemon_s=dead_s)
+    found = governed(command(3.15), vehicle((1.0, 0.0)), limits)
+    stick = found.stick_limit_m_s
+
+    def way_and_speed(stick_m_s: float) -> tuple[float, float]:
+        v, way, dt = 1.0, 0.0, 1e-4
+        for _ in range(round(dead_s * 1e4)):
+            v += (stick_m_s - v) / TAU_S * dt
+            way += v * dt
+        return way + v**2 / 4.0, v
+
+    # the reference's steps; ten halvings
+    way, after = way_and_speed(stick)
+    assert way <= 3.0 + 1e-3
+    assert after <= found.limit_m_s + 1e-3
+    way, after = way_and_speed(stick + 0.03)
+    assert way > 3.0 or after > found.limit_m_s
+
+
+def test_the_time_between_the_cameras_counts_within_a_metre_as_well() -> None:
+    late = replace(LIMITS, sync_error_s=0.01)
+    found = governed(command(60.0, z_close_m=0.8), limits=late)
+    # 0.8 / (160 + 0.2 * 500 / 0.8 + 1) / 0.01, less than sideways 0.16
+    assert found.limit_m_s == pytest.approx(min(0.8 / 286.0, 0.8 / 500.0) / 0.01)

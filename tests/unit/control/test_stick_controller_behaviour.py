@@ -210,3 +210,18 @@ def test_what_the_loop_has_learned_is_forgotten_when_the_sticks_were_not_ours() 
     assert (tired.roll_us, tired.pitch_us) != (fresh.roll_us, fresh.pitch_us)
     worn.reset()
     assert replace(last(worn, 1, lambda k: None), t_ns=0, expires_ns=0) == fresh
+
+
+def test_a_command_to_stand_still_is_neutral_sticks() -> None:
+    held = sticks(order(v_ned_m_s=(0.0, 0.0, 0.0)))
+    assert (held.roll_us, held.pitch_us) == (1500, 1500)
+
+
+def test_a_stick_against_the_motion_is_left_as_strong_as_it_is() -> None:
+    """Flying north near something and asked to go south: the stick that brakes is not turned into one that pushes."""
+    controller = StickController(MODEL, Governor(LIMITS), VelocityTuning())
+    state = replace(STEADY, v_ned_m_s=(0.6, 0.0, 0.0))
+    held, told = controller.step(order(clear_m=1.2, v_ned_m_s=(-3.0, 0.0, 0.0)), SEEN, state, 9 * S)
+    forward, _ = MODEL.speed_for_sticks(held.roll_us, held.pitch_us, 1.5)
+    assert forward < -told.stick_limit_m_s
+    assert forward < -0.1
