@@ -4,13 +4,16 @@ Tests in e2e/ and hw/ run at the clock's pace over sockets and processes: they a
 machine, so the ordinary run leaves them out (`python3 start.py test -m realtime` runs them).
 """
 
+import os
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 settings.register_profile("morpheyes", deadline=None, derandomize=True)
-settings.load_profile("morpheyes")
+# that it fails is enough to know of a mutant: no search for the smallest example
+settings.register_profile("mutants", settings.get_profile("morpheyes"), phases=(Phase.explicit, Phase.generate))
+settings.load_profile("mutants" if "MUTATING" in os.environ else "morpheyes")
 
 AT_THE_CLOCKS_PACE = {"e2e", "hw"}
 

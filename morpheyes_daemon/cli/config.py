@@ -76,7 +76,7 @@ def _is_mission(file: Path) -> bool:
     """A mission file names its strategy; everything else is taken for a vehicle configuration."""
     import yaml
 
-    from morpheyes_daemon.config.yaml_errors import parse_yaml, read_text
+    from morpheyes_daemon.config.yaml_reader import parse_yaml, read_text
 
     if not file.suffix:
         return not file.is_file()

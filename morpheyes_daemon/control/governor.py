@@ -96,7 +96,8 @@ class Governor:
             name: stopping.speed_for_distance_m(max(0.0, distance - limits.standoff_m), height_m, limits.dead_daemon_s)
             for name, distance in free_m.items()
         }
-        bounds["sync"] = self._sync_bound(summary, command)
+        if limits.sync_error_s > 0.0:
+            bounds["sync"] = self._sync_bound(summary, command)
         bounds["cap"] = limits.max_speed_m_s
         bounds = {name: value if math.isfinite(value) else 0.0 for name, value in bounds.items()}
         name = min(bounds, key=lambda key: bounds[key])
@@ -126,8 +127,6 @@ class Governor:
 
     def _sync_bound(self, summary: DepthSummary, command: MissionCommand) -> float:
         """Return the speed at which the exposure offset costs `sync_tolerance_px` at the nearest obstacle."""
-        if self._limits.sync_error_s <= 0.0:
-            return math.inf
         z_m = command.z_close_m if math.isfinite(command.z_close_m) else summary.nearest_m
         if not math.isfinite(z_m) or z_m <= 0.0:
             return self._limits.max_speed_m_s

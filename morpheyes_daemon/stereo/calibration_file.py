@@ -17,7 +17,8 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
-from morpheyes_daemon.config.yaml_errors import parse_yaml, read_text, validate
+from morpheyes_daemon.config.yaml_errors import validate
+from morpheyes_daemon.config.yaml_reader import parse_yaml, read_text
 from morpheyes_daemon.errors import CalibrationError, ConfigError
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, CameraMount, RigModel

@@ -87,7 +87,7 @@ class Supervisor:
     async def _renew(self) -> None:
         ticker = Ticker(self._clock, RATE_HZ)
         while True:
-            self._monitor.gate.renew(Lease.SUPERVISOR, self._clock.now_ns() + self._lease_ns)
+            self._gate.renew(Lease.SUPERVISOR, self._clock.now_ns() + self._lease_ns)
             await ticker.wait()
 
     async def _keep(self, task: Task) -> None:

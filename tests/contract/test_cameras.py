@@ -412,8 +412,12 @@ async def test_a_simulator_that_ends_is_lost_and_found_again(tmp_path: Path) -> 
 
 async def test_a_socket_left_by_a_killed_simulator_is_taken_over(tmp_path: Path) -> None:
     (tmp_path / "frames").touch()
-    async with serving(f"unix:{tmp_path}/frames"):
-        pass
+    address = f"unix:{tmp_path}/frames"
+    async with serving(address):
+        camera = SimulatorCamera(address, sim(address))
+        await camera.open()
+        assert (await camera.read()).left.size > 0
+        await camera.close()
 
 
 async def test_over_tcp_garbage_and_other_sizes_are_told(unused_tcp_port: int) -> None:

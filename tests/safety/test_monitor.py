@@ -499,9 +499,12 @@ def test_hold_never_ends_by_itself() -> None:
 def test_out_of_hold_only_a_new_flip_engages() -> None:
     cockpit = Cockpit().into(State.HOLD)
     cockpit.silent.clear()
+    cockpit.run(1.0)
+    assert cockpit.state is State.HOLD
     cockpit.switch_us = OFF_US
     cockpit.run(0.3)
     cockpit.engage()
+    assert cockpit.state is State.ENGAGED
 
 
 # -- the mission ------------------------------------------------------------------------------------------------

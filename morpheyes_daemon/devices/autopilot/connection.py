@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from morpheyes_daemon.bus import EventLog, OnError, Topics, call_each, raise_it
 from morpheyes_daemon.clock import MS, Clock, S, Ticker, wall_time_s
 from morpheyes_daemon.config.vehicle import AutopilotConfig
-from morpheyes_daemon.config.yaml_errors import read_text
+from morpheyes_daemon.config.yaml_reader import read_text
 from morpheyes_daemon.devices.autopilot.commands import CommandClient
 from morpheyes_daemon.devices.autopilot.message_intervals import STREAMS, request_streams
 from morpheyes_daemon.devices.autopilot.override_echo import OverrideEcho

@@ -12,6 +12,11 @@ import numpy as np
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.transforms import Array
 
+IN_VIEW_RAD = 1e-6
+"""The goal is in view when clipping its direction to the view changes it by less than this.
+
+Chosen: far above the rounding of an angle, far below the step between headings."""
+
 STALLED_S = 15.0
 """Time without progress towards the goal after which boundary following begins.
 

@@ -21,7 +21,7 @@ from morpheyes_daemon.messages.mission import Observation
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.strategies.base import Craft, Strategy, View
 from morpheyes_daemon.strategies.command import CommandBuilder, Decision
-from morpheyes_daemon.strategies.forest.bug_algorithm import BugAlgorithm
+from morpheyes_daemon.strategies.forest.bug_algorithm import IN_VIEW_RAD, BugAlgorithm
 from morpheyes_daemon.strategies.forest.obstacle_memory import MIN_KEEP_FRAMES, ObstacleMemory
 from morpheyes_daemon.strategies.forest.parameters import OPEN_BEYOND_M, ForestParameters
 from morpheyes_daemon.strategies.forest.turn_feasibility import (
@@ -255,7 +255,7 @@ class Forest(Strategy):
             return None
         clipped_goal = _clip(goal_rad, headings)
         z_goal = float(free_distance_m(obstacles, np.array([clipped_goal]), half_width, reach)[0])
-        if z_goal >= distance_m and clipped_goal == goal_rad:
+        if z_goal >= distance_m and abs(wrap_rad(clipped_goal - goal_rad)) < IN_VIEW_RAD:
             self._bug.end(observation.now_ns)
         if self._bug.side:
             best = self._bug.heading(headings, free)

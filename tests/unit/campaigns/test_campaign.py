@@ -251,3 +251,6 @@ def test_a_wrong_option_is_one_sentence_before_anything_is_made(
 def test_any_number_of_flights_at_once_and_one_per_core_are_allowed() -> None:
     for jobs in (-1, 1, 40):
         require_jobs(jobs)
+    for jobs in (0, -2):
+        with pytest.raises(UsageError):
+            require_jobs(jobs)
