@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from morpheyes_daemon.benchmarks.calibration_error import evaluate_rig
-from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount, ServoMotion
@@ -22,6 +21,7 @@ from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame, Vehicl
 from morpheyes_daemon.perception.camera_motion import CameraMotion, camera_motion
 from morpheyes_daemon.perception.extrinsics_monitor import ExtrinsicsLimits, ExtrinsicsMonitor, ExtrinsicsReport
 from morpheyes_daemon.perception.yaw_estimator import STILL, Uncertain
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.simulation.rendering.renderer import Renderer

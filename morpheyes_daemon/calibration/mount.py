@@ -18,9 +18,9 @@ import numpy as np
 
 from morpheyes_daemon.calibration.solver.initial_guess import board_pose
 from morpheyes_daemon.calibration.targets.boards import Board, find_corners
-from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.messages.core import Image
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import CameraMount
 from morpheyes_daemon.transforms import Array, R_from_rotvec, R_from_rpy, rotvec_from_R

@@ -54,12 +54,7 @@ def build() -> typer.Typer:
         """Fly a mission in the simulator with `morpheyes sim forest`; run the daemon with `morpheyes run`."""
 
     for name in COMMANDS:
-        try:
-            module = importlib.import_module(f"{__name__}.{name}")
-        except ModuleNotFoundError as error:
-            if error.name != f"{__name__}.{name}":
-                raise
-            continue
+        module = importlib.import_module(f"{__name__}.{name}")
         if hasattr(module, "app"):
             root.add_typer(module.app, name=name)
         else:

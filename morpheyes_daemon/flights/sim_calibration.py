@@ -8,11 +8,11 @@ from pathlib import Path
 from morpheyes_daemon.calibration.mount import solve_mount, ways_up
 from morpheyes_daemon.calibration.solver.result import rig_model
 from morpheyes_daemon.calibration.solver.solver import calibrate
-from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.flights.sim_boards import DEFAULT_BOARD, observe_mount, observe_twin, twin_name
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.simulation.rendering.texture_cache import cache_folder
 from morpheyes_daemon.stereo.calibration_file import read_calibration, write_calibration
 from morpheyes_daemon.stereo.rig import RigModel

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
-import numpy as np
-
+from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.config.yaml_errors import validate
 from morpheyes_daemon.errors import CalibrationError
@@ -14,7 +12,6 @@ from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import Craft, Strategy
 from morpheyes_daemon.strategies.registry import find_strategy
-from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rpy, pose
 
 
 def fitting_rig(calibration: Path, config: VehicleConfig) -> RigModel:
@@ -33,12 +30,9 @@ def fitting_rig(calibration: Path, config: VehicleConfig) -> RigModel:
 
 def build_craft(config: VehicleConfig) -> Craft:
     """Return what strategies may know of the vehicle."""
-    mount = config.camera.mount
-    tilt = R_from_rpy(0.0, math.radians(mount.tilt_up_deg), 0.0)
-    position = np.array([mount.forward_mm, mount.right_mm, mount.down_mm]) / 1e3
     return Craft(
         footprint=config.footprint,
-        T_frd_rig=pose(tilt @ R_FRD_CAM, position),
+        T_frd_rig=T_frd_rig(config.camera.mount),
         baseline_range_m=config.baseline_range_m,
         frame_period_s=1.0 / config.camera.rate_hz,
         depth_sigmas=config.safety.depth_sigmas,

@@ -15,6 +15,7 @@ import numpy as np
 from morpheyes_daemon.clock import stopwatch_s
 from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.messages.core import (
+    SECTORS,
     DepthMap,
     DepthSummary,
     Event,
@@ -45,9 +46,6 @@ from morpheyes_daemon.strategies.base import View
 
 _REASONS = {ImageFault.MISALIGNED: Reason.CALIBRATION_DRIFT, ImageFault.APART: Reason.EYES_APART}
 """What is no fault of the images but of the rig."""
-
-SECTORS = 72
-"""Sectors of OBSTACLE_DISTANCE over the horizontal field of view."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,9 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages.core import FloatMap, Image
-
-Mask = NDArray[np.bool_]
+from morpheyes_daemon.messages.core import FloatMap, Image, Mask
 
 COARSE_TALL = 2
 """Coarse pixels are so much taller than wide: half the time, and what is near is tall as well."""

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import CalibrationError
-from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole, frozen
+from morpheyes_daemon.messages.core import FloatMap, Image, Mask, Pinhole, frozen
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import Array, inverse, pose
@@ -42,7 +41,7 @@ class RectifiedEye:
     R_rect_cam: Array
     pinhole: Pinhole
     map_px: FloatMap
-    seen: NDArray[np.bool_] | None
+    seen: Mask | None
 
     def image(self, raw: Image) -> Image:
         """Return the rectified image (H, W) or (H, W, 3) of a raw one."""

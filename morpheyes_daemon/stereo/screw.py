@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from morpheyes_daemon.transforms import Array, R_from_q, pose, q_from_R
+from morpheyes_daemon.transforms import Array, R_from_q, pose
 
 _SERIES_BELOW_RAD = 1e-2
 """Half angles under which series replace the closed forms; the terms left out are below 1e-17 there."""
@@ -21,11 +21,6 @@ def dual_quaternion(q: Array, t_m: Array) -> Array:
     """Return the unit dual quaternion (8,) of rotation q (4,), which is normalised here, and translation t (3,)."""
     real = np.asarray(q, dtype=np.float64) / np.linalg.norm(q)
     return np.concatenate([real, 0.5 * _multiply_q(np.concatenate([[0.0], t_m]), real)])
-
-
-def dual_quaternion_from_pose(T: Array) -> Array:
-    """Return the unit dual quaternion (8,) of a pose (4, 4)."""
-    return dual_quaternion(q_from_R(T[:3, :3]), T[:3, 3])
 
 
 def pose_from_dual_quaternion(dq: Array) -> Array:

@@ -9,10 +9,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import CalibrationError, InputError
-from morpheyes_daemon.messages.core import BaselineEstimate, FloatMap, Image, StereoFrame
+from morpheyes_daemon.messages.core import BaselineEstimate, FloatMap, Image, Mask, StereoFrame
 from morpheyes_daemon.stereo.depth import DepthEstimator, depth_from_disparity, grey, near_limit_m
 from morpheyes_daemon.stereo.matching import MatchSettings, disparity_range, match
 from morpheyes_daemon.stereo.rig import RigModel
@@ -27,8 +26,8 @@ class StillDepth:
 
     left: Image
     depth_m: FloatMap
-    near: NDArray[np.bool_]
-    half_occluded: NDArray[np.bool_]
+    near: Mask
+    half_occluded: Mask
     near_limit_m: float
     baseline_m: float
     f_px: float

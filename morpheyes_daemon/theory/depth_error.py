@@ -20,8 +20,3 @@ def farthest_m(baseline_m: float, f_px: float, disparity_error_px: float, relati
 def nearest_m(baseline_m: float, f_px: float, num_disparities: int) -> float:
     """Return Z_min = b f / numDisparities, nearer than which nothing can be matched (paper-notes 11)."""
     return baseline_m * f_px / num_disparities
-
-
-def baseline_for_m(z_m: float, f_px: float, disparity_error_px: float, relative_error: float) -> float:
-    """Return the smallest baseline with which a depth is known to within `relative_error`."""
-    return z_m * disparity_error_px / (f_px * relative_error)

@@ -49,8 +49,3 @@ def sync_speed_bound_m_s(
         return math.inf
     forward = min(off_axis_m(z_m, baseline_m, f_px, half_width_px, k_px), approaching_m(z_m, baseline_m, f_px, k_px))
     return min(forward, sideways_m(z_m, f_px, k_px)) / dt_s
-
-
-def sync_yaw_bound_rad_s(*, dt_s: float, f_px: float, k_px: float = 1.0) -> float:
-    """Return the largest yaw rate that keeps the disparity error within `k_px` on the axis."""
-    return math.inf if dt_s <= 0.0 else yaw_rad(f_px, k_px) / dt_s

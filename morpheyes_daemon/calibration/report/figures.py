@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from morpheyes_daemon.calibration.report.depth_error_budget import DISTANCES_M, Conditions, depth_errors
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
-from morpheyes_daemon.transforms import rpy_from_R
+from morpheyes_daemon.transforms import R_FRD_CAM, rpy_from_R
 
 INK, MUTED, GRID = "#1c2430", "#66707f", "#e3e7ec"
 BLUE, ORANGE, GREEN, RED, PURPLE = "#2f6fde", "#e8833a", "#2a9d6f", "#d1453b", "#8a63d2"
@@ -223,6 +223,5 @@ def _cell_centre(rig: RigModel, shape: tuple[int, ...], row: int, column: int) -
 
 def _angles(R_cam0_cam1: Any) -> tuple[float, float, float]:
     """Return pitch (about x), yaw (about y, to the right) and roll (about z) of the right eye in the left, rad."""
-    axes = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    roll, pitch, yaw = rpy_from_R(axes @ R_cam0_cam1 @ axes.T)
+    roll, pitch, yaw = rpy_from_R(R_FRD_CAM @ R_cam0_cam1 @ R_FRD_CAM.T)
     return pitch, yaw, roll

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from morpheyes_daemon.calibration.solver.projection import camera_from_vector
 from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px, row_error_px
 from morpheyes_daemon.calibration.solver.solver import Calibration, resolve
-from morpheyes_daemon.calibration.targets.observations import Progress, silent
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import Array
 

@@ -22,8 +22,9 @@ from morpheyes_daemon.calibration.solver.uncertainty import baseline_uncertainty
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.calibration.targets.detection import CornerCache, observe
 from morpheyes_daemon.calibration.targets.image_pairs import read_folder
-from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.errors import CalibrationError
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.stereo.calibration_file import write_calibration
 
 CORNERS_SUFFIX = ".corners.npz"

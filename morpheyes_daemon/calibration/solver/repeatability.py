@@ -17,8 +17,9 @@ from morpheyes_daemon.calibration.solver import bundle_adjustment as bundle
 from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE, Prior, RigState
 from morpheyes_daemon.calibration.solver.initial_guess import board_pose
 from morpheyes_daemon.calibration.solver.projection import camera_vector
-from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.errors import InputError
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import Array, rotvec_from_R
 

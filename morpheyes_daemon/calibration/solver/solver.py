@@ -18,7 +18,8 @@ from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE, Pr
 from morpheyes_daemon.calibration.solver.initial_guess import first_guess
 from morpheyes_daemon.calibration.solver.outliers import Outlier, find_outliers, reject_outliers, without
 from morpheyes_daemon.calibration.solver.rail_model import Rail, fit_rail, with_rail
-from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
+from morpheyes_daemon.calibration.targets.observations import Observations
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
 
 KNOT_SPACING_M = 0.012

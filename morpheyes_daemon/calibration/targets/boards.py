@@ -18,6 +18,7 @@ import numpy as np
 from morpheyes_daemon.calibration.targets.subpixel import saddle_points
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.messages.core import Image
+from morpheyes_daemon.stereo.depth import grey
 from morpheyes_daemon.transforms import Array
 
 _WINDOW_SHARE = 0.3
@@ -118,11 +119,6 @@ def parse_board(text: str, square_m: float, marker_m: float | None = None) -> Bo
     if not 0.2 < share < 1.0:
         raise UsageError(f"A marker must be smaller than its square, not {share:.2f} of it; measure both.")
     return Board(columns - 1, rows - 1, square_m, "charuco", (match[4] or "5X5_1000").upper(), share)
-
-
-def grey(image: Image) -> Image:
-    """Return an image (H, W) or (H, W, 3) BGR as grey (H, W)."""
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
 def find_corners(image: Image, board: Board) -> Array | None:

@@ -20,9 +20,10 @@ import numpy as np
 
 from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners
 from morpheyes_daemon.calibration.targets.image_pairs import BaselineFolder, PairFiles
-from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import Image
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.transforms import Array
 
 _FEWEST_VIEWS = 3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,13 +9,6 @@ from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.transforms import Array
-
-Progress = Callable[[str, int, int], None]
-"""Told what is being done, how much is done, and of how much."""
-
-
-def silent(_what: str, _done: int, _total: int) -> None:
-    """Show no progress."""
 
 
 @dataclass(frozen=True, eq=False)

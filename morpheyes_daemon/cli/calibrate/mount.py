@@ -37,13 +37,13 @@ def mount(
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file
     from morpheyes_daemon.cli.calibrate.options import choose_board
     from morpheyes_daemon.cli.terminal.progress import progress_line
+    from morpheyes_daemon.config.mount_pose import T_frd_rig
     from morpheyes_daemon.config.packaged import load_config
-    from morpheyes_daemon.perception.craft import build_craft
 
     rig = read_calibration(file)
     known = read_board_file(folder) if folder.is_dir() else {}
     chosen = choose_board(known, board, square_mm, marker_mm, ask=not as_json and sys.stdin.isatty())
-    R_frd_rig = build_craft(load_config(config)).T_frd_rig[:3, :3]
+    R_frd_rig = T_frd_rig(load_config(config).camera.mount)[:3, :3]
     with progress_line() as progress:
         views = read_mount_folder(folder, chosen, rig.cam0, progress)
     found = solve_mount(views, R_frd_rig, ways_up(chosen))
