@@ -1,8 +1,8 @@
-"""How the left eye is turned on the vehicle, from a board that stands still before a vehicle that is turned by hand.
+"""How the left camera is turned on the vehicle, from a board that stands still before a vehicle that is turned by hand.
 
-Boards alone tell the eyes from each other; where they point on the body decides where an opening is believed to be.
-The autopilot's attitude and the board's pose in the left eye turn together, and what lies between them is the eye's
-rotation on the body (rotation part of robot-world hand-eye calibration, A X B = Y; Shah 2013). No position is used.
+Boards alone tell the cameras from each other; where they point on the body decides where an opening is believed to be.
+The autopilot's attitude and the board's pose in the left camera turn together, and what lies between them is the camera's
+rotation on the body (rotation part of robot-world hand-camera calibration, A X B = Y; Shah 2013). No position is used.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ MOUNT_VIEWS, FEWEST_VIEWS = 48, 10
 """Pictures to take, and to work with at least."""
 
 WORST_SIGMA_RAD = 4e-3
-"""One sigma of a rotation that is no better than a careful builder's eye."""
+"""One sigma of a rotation that is no better than a careful builder's camera."""
 
 _ROUNDS = 20
-_STRAY = 3.0
+_OUTLIER_FACTOR = 3.0
 """A view whose rotations disagree by so many times the median counts less and less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountViews:
-    """The vehicle's attitudes R_ned_frd (n, 3, 3) and the board in the left eye, R_cam0_board (n, 3, 3)."""
+    """The vehicle's attitudes R_ned_frd (n, 3, 3) and the board in the left camera, R_cam0_board (n, 3, 3)."""
 
     names: tuple[str, ...]
     R_ned_frd: Array
@@ -51,7 +51,7 @@ class MountViews:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountSolution:
-    """The left eye's rotation on the bar; `rms_rad` is what is left between attitude and board in a view."""
+    """The left camera's rotation on the bar; `rms_rad` is what is left between attitude and board in a view."""
 
     mount: CameraMount
     rms_rad: float
@@ -60,9 +60,9 @@ class MountSolution:
 
 
 def solve_mount(views: MountViews, R_frd_rig: Array, turns: int) -> MountSolution:
-    """Return the rotation of the left eye on a bar that sits on the body as `R_frd_rig` (3, 3) says.
+    """Return the rotation of the left camera on a bar that sits on the body as `R_frd_rig` (3, 3) says.
 
-    `turns` is the board's `ways_up`. Gauss-Newton on rotation vectors with Huber's weights. Raises CalibrationError
+    `turns` is the board's `orientations`. Gauss-Newton on rotation vectors with Huber's weights. Raises CalibrationError
     when views are too few or the vehicle was hardly turned.
     """
     if len(views.names) < FEWEST_VIEWS:
@@ -70,11 +70,11 @@ def solve_mount(views: MountViews, R_frd_rig: Array, turns: int) -> MountSolutio
             f"{len(views.names)} pictures show the board, {FEWEST_VIEWS} are needed: take more, from all sides."
         )
     A = views.R_ned_frd @ R_frd_rig
-    B = _same_way_up(A, views.R_cam0_board, turns)
+    B = _in_one_orientation(A, views.R_cam0_board, turns)
     X, Y = np.eye(3), A[0] @ B[0]
     J = np.concatenate([B.transpose(0, 2, 1), np.broadcast_to(-np.eye(3), B.shape)], axis=2).reshape(-1, 6)
     for _ in range(_ROUNDS):
-        off = _off(A, X, B, Y)
+        off = _residuals(A, X, B, Y)
         weight = np.repeat(np.sqrt(_huber(np.linalg.norm(off, axis=1))), 3)
         step = np.linalg.lstsq(J * weight[:, None], -off.ravel() * weight, rcond=None)[0]
         X, Y = X @ R_from_rotvec(step[:3]), Y @ R_from_rotvec(step[3:])
@@ -82,10 +82,10 @@ def solve_mount(views: MountViews, R_frd_rig: Array, turns: int) -> MountSolutio
             break
     rms = math.sqrt(float(((off.ravel() * weight) ** 2).sum() / ((weight**2).sum() - 6)))
     sigma = rms * _sigmas((J * weight[:, None]).T @ (J * weight[:, None]))
-    turned = _turned_rad(A)
+    turned = _rotation_spread_rad(A)
     if not sigma.max() <= WORST_SIGMA_RAD:
         raise CalibrationError(
-            f"The eye's rotation is only known to {math.degrees(float(sigma.max())):.2f} degrees: turn the vehicle "
+            f"The camera's rotation is only known to {math.degrees(float(sigma.max())):.2f} degrees: turn the vehicle "
             f"farther (these pictures: {math.degrees(turned):.0f} degrees) about all three axes, and hold it still."
         )
     x = rotvec_from_R(X)
@@ -117,7 +117,7 @@ def read_mount_folder(folder: Path, board: Board, cam0: CameraIntrinsics, progre
 
 
 def board_rotation(image: Image, board: Board, cam0: CameraIntrinsics) -> Array | None:
-    """Return R_cam0_board (3, 3) of the board in a picture of the left eye, None when it is not seen."""
+    """Return R_cam0_board (3, 3) of the board in a picture of the left camera, None when it is not seen."""
     corners = find_corners(image, board)
     if corners is None:
         return None
@@ -126,7 +126,7 @@ def board_rotation(image: Image, board: Board, cam0: CameraIntrinsics) -> Array 
     return None if T_cam0_board is None else T_cam0_board[:3, :3]
 
 
-def ways_up(board: Board) -> int:
+def orientations(board: Board) -> int:
     """Return in how many ways up a board looks the same."""
     if board.kind == "charuco":
         return 1
@@ -154,7 +154,7 @@ def attitude_rows(path: Path) -> Iterator[tuple[str, Array]]:
         yield str(row["picture"]), R_from_rpy(*angles)
 
 
-def _same_way_up(A: Array, B: Array, turns: int) -> Array:
+def _in_one_orientation(A: Array, B: Array, turns: int) -> Array:
     """Return the board's rotations as of one and the same corner: it looks alike when turned about its normal."""
     about = [R_from_rotvec(np.array([0.0, 0.0, 2 * math.pi * k / turns])) for k in range(turns)]
     ways = B[:, None] @ np.array(about)
@@ -162,25 +162,25 @@ def _same_way_up(A: Array, B: Array, turns: int) -> Array:
     return np.asarray(ways[np.arange(len(B)), likeness.argmax(axis=1)])
 
 
-def _off(A: Array, X: Array, B: Array, Y: Array) -> Array:
+def _residuals(A: Array, X: Array, B: Array, Y: Array) -> Array:
     """Return what is missing (n, 3) in A X B = Y, as rotation vectors in the board's axes."""
     return np.array([rotvec_from_R(R) for R in Y.T @ A @ X @ B])
 
 
 def _huber(off: Array) -> Array:
-    limit = _STRAY * max(float(np.median(off)), 1e-9)
+    limit = _OUTLIER_FACTOR * max(float(np.median(off)), 1e-9)
     return np.asarray(np.minimum(1.0, limit / np.maximum(off, 1e-12)))
 
 
 def _sigmas(information: Array) -> Array:
-    """Return one sigma (3,) of the eye's rotation for unit noise, infinite where the vehicle was not turned at all."""
+    """Return one sigma (3,) of the camera's rotation for unit noise, infinite where the vehicle was not turned at all."""
     values, vectors = np.linalg.eigh(information)
     if values[0] < 1e-6 * values[-1]:
         return np.full(3, np.inf)
     return np.asarray(np.sqrt(np.diag(vectors / values @ vectors.T)[:3]))
 
 
-def _turned_rad(A: Array) -> float:
+def _rotation_spread_rad(A: Array) -> float:
     """Return the root mean square angle of the attitudes about their middle."""
     vectors = np.array([rotvec_from_R(A[0].T @ R) for R in A])
     return math.sqrt(float(((vectors - vectors.mean(axis=0)) ** 2).sum(axis=1).mean()))

@@ -40,7 +40,7 @@ def build() -> typer.Typer:
     """Return the whole command line."""
     root = typer.Typer(
         name="morpheyes",
-        help="The onboard daemon of a quadrotor whose stereo eyes move apart, and its simulator.",
+        help="The onboard daemon of a quadrotor whose stereo cameras move apart, and its simulator.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,

@@ -12,10 +12,10 @@ from morpheyes_daemon.stereo.calibration_file import read_calibration
 
 
 def command(
-    left: Annotated[Path, typer.Argument(help="Left picture, or one with both eyes side by side.")],
+    left: Annotated[Path, typer.Argument(help="Left picture, or one with both cameras side by side.")],
     right: Annotated[Path | None, typer.Argument(help="Right picture.")] = None,
     focal_px: Annotated[float | None, typer.Option(help="Focal length of rectified pictures.")] = None,
-    baseline_m: Annotated[float | None, typer.Option(help="Distance between the eyes; nominal with a rig.")] = None,
+    baseline_m: Annotated[float | None, typer.Option(help="Distance between the cameras; nominal with a rig.")] = None,
     doffs_px: Annotated[float, typer.Option(help="Difference of the principal points, x right - x left.")] = 0.0,
     calibration: Annotated[Path | None, typer.Option(help="Calibration file; the pictures are raw then.")] = None,
     near_m: Annotated[float | None, typer.Option(help="Nearest depth to look for.")] = None,

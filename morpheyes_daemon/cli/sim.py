@@ -33,7 +33,7 @@ def command(
     calibration: Annotated[
         str | None,
         typer.Option(
-            help="'solved' from rendered boards, 'mounted': the eyes' mount measured too (usual for gaps), 'exact', "
+            help="'solved' from rendered boards, 'mounted': the cameras' mount measured too (usual for gaps), 'exact', "
             "or a file."
         ),
     ] = None,

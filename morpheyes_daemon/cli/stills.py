@@ -17,7 +17,7 @@ def command(
     step_m: Annotated[float, typer.Option(help="Way between them.")] = 1.0,
     height_m: Annotated[float, typer.Option(min=0.1, help="Of the cameras above ground.")] = 1.5,
     yaw_deg: Annotated[float, typer.Option(help="Where the cameras look, 0: along the course.")] = 0.0,
-    baseline: Annotated[float, typer.Option(min=0.01, max=1.0, help="Metres between the eyes.")] = 0.2,
+    baseline: Annotated[float, typer.Option(min=0.01, max=1.0, help="Metres between the cameras.")] = 0.2,
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "640x480",
     samples: Annotated[int, typer.Option(min=1, max=4096, help="Paths per pixel; 32 take minutes a picture.")] = 32,
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out/stills"),

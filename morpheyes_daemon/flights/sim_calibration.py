@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from morpheyes_daemon.calibration.mount import solve_mount, ways_up
+from morpheyes_daemon.calibration.mount import solve_mount, orientations
 from morpheyes_daemon.calibration.solver.result import rig_model
 from morpheyes_daemon.calibration.solver.solver import calibrate
 from morpheyes_daemon.config.mount_pose import T_frd_rig
@@ -41,7 +41,9 @@ def mounted_rig_file(seed: int, cache_dir: Path | None = None, progress: Progres
     path = solved.with_name(f"{solved.stem}-mounted-v{_MOUNT_METHOD}.yaml")
     if not _readable(path):
         rig = read_calibration(solved)
-        found = solve_mount(observe_mount(seed, rig.cam0, progress), T_frd_rig(Mount())[:3, :3], ways_up(DEFAULT_BOARD))
+        found = solve_mount(
+            observe_mount(seed, rig.cam0, progress), T_frd_rig(Mount())[:3, :3], orientations(DEFAULT_BOARD)
+        )
         write_calibration(replace(rig, mount=found.mount), path)
     return path
 

@@ -1,4 +1,4 @@
-"""The calibrated rig, the craft and the strategy as one vehicle configuration gives them."""
+"""Builds the calibrated rig, the craft and the strategy of one vehicle configuration."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from morpheyes_daemon.strategies.registry import find_strategy
 
 
 def fitting_rig(calibration: Path, config: VehicleConfig) -> RigModel:
-    """Return the calibrated rig at the camera's size.
+    """Return the calibrated rig at the configured image size.
 
-    Raises CalibrationError when it is another camera's, or lacks baselines that the vehicle may be asked for.
+    Raises CalibrationError when the file cannot be read, its images have another aspect ratio, or its calibrated
+    range does not cover the configured baselines.
     """
     rig = read_calibration(calibration).rescaled(config.camera.width_px, config.camera.height_px)
     try:
@@ -29,7 +30,7 @@ def fitting_rig(calibration: Path, config: VehicleConfig) -> RigModel:
 
 
 def build_craft(config: VehicleConfig) -> Craft:
-    """Return what strategies may know of the vehicle."""
+    """Return the properties of the vehicle that strategies use."""
     return Craft(
         footprint=config.footprint,
         T_frd_rig=T_frd_rig(config.camera.mount),
@@ -41,7 +42,7 @@ def build_craft(config: VehicleConfig) -> Craft:
 
 
 def build_strategy(mission: MissionFile, config: VehicleConfig) -> Strategy:
-    """Return the mission's strategy with its checked parameters; raises ConfigError."""
+    """Return the mission's strategy; raises ConfigError when it does not exist or its parameters are invalid."""
     kind = find_strategy(mission.strategy)
     parameters = validate(mission.parameters, kind.Parameters, "parameters", None)
     return kind(parameters, build_craft(config))

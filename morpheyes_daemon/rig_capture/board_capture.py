@@ -21,7 +21,7 @@ from morpheyes_daemon.rig_capture.rig_session import RigSession
 
 
 @dataclass(frozen=True)
-class Scene:
+class CaptureStatus:
     """What a person should see of the capture right now."""
 
     nominal_m: float
@@ -29,7 +29,7 @@ class Scene:
     hint: Hint
 
 
-Show = Callable[[Scene], None]
+Show = Callable[[CaptureStatus], None]
 
 
 async def capture_boards(
@@ -89,7 +89,7 @@ async def _one_baseline(stand: RigSession, folder: Path, board: Board, nominal_m
         if hint.kept:
             number += 1
             write_pair(folder, number, pair)
-        show(Scene(nominal_m, guide, hint))
+        show(CaptureStatus(nominal_m, guide, hint))
     return number
 
 
@@ -102,7 +102,7 @@ async def _one_visit(stand: RigSession, folder: Path, board: Board, nominal_m: f
         guide.consider(pair.left, pair.right)
         again = await stand.pair()
         hint = guide.consider(again.left, again.right)
-        show(Scene(nominal_m, guide, hint))
+        show(CaptureStatus(nominal_m, guide, hint))
         if hint.kept:
             write_pair(folder, number + 1, again)
             return number + 1
@@ -112,10 +112,10 @@ def write_pair(folder: Path, number: int, pair: RawPair) -> None:
     """Write a pair as left and right pictures of a number, each whole or not at all."""
     try:
         folder.mkdir(exist_ok=True)
-        for eye, image in (("left", pair.left), ("right", pair.right)):
-            temporary = folder / f".{eye}.part.png"
+        for side, image in (("left", pair.left), ("right", pair.right)):
+            temporary = folder / f".{side}.part.png"
             cv2.imwrite(str(temporary), image)
-            temporary.replace(folder / f"{eye}{number:02d}.png")
+            temporary.replace(folder / f"{side}{number:02d}.png")
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror}); free some space and go on.") from None
 

@@ -31,8 +31,8 @@ from morpheyes_daemon.transforms import Array, R_from_rpy, rotvec_from_R
 
 STILL_RAD_S = 0.03
 FRESH_NS = S // 5
-OTHERWISE_RAD = math.radians(8.0)
-WAIT_S = 10.0
+MIN_NEW_ROTATION_RAD = math.radians(8.0)
+ATTITUDE_TIMEOUT_S = 10.0
 
 Say = Callable[[int, str], None]
 """Told how many pictures are kept, and what to do next."""
@@ -48,7 +48,7 @@ class HandHeldVehicle:
 
     async def __aenter__(self) -> Self:
         self._task = asyncio.create_task(self._hub.run(), name="autopilot")
-        for _ in range(round(WAIT_S * 20)):
+        for _ in range(round(ATTITUDE_TIMEOUT_S * 20)):
             if self.state.attitude_t_ns:
                 return self
             await self._clock.sleep_until_ns(self._clock.now_ns() + S // 20)
@@ -70,7 +70,7 @@ class HandHeldVehicle:
 async def capture_mount(
     stand: RigSession, vehicle: Callable[[], VehicleState], clock: Clock, out: Path, board: Board, wanted: int, say: Say
 ) -> int:
-    """Fill `out` with `wanted` pictures and attitudes, eyes at their smallest baseline; returns how many it holds.
+    """Fill `out` with `wanted` pictures and attitudes, cameras at their smallest baseline; returns how many it holds.
 
     Raises DeviceError when camera, servo or autopilot fail, InputError when `out` cannot be written.
     """
@@ -84,7 +84,7 @@ async def capture_mount(
         state = vehicle()
         R = R_from_rpy(state.roll_rad, state.pitch_rad, state.yaw_rad)
         fresh = clock.now_ns() - state.attitude_t_ns < FRESH_NS
-        last, hint = _judged(pair.left, board, state, fresh, R, kept, last)
+        last, hint = _evaluate(pair.left, board, state, fresh, R, kept, last)
         if not hint:
             kept.append(R)
             write_pair(out, len(kept), pair)
@@ -93,7 +93,7 @@ async def capture_mount(
     return len(kept)
 
 
-def _judged(
+def _evaluate(
     left: Image, board: Board, state: VehicleState, fresh: bool, R: Array, kept: list[Array], last: Array | None
 ) -> tuple[Array | None, str]:
     """Return the board's corners and what to do; nothing when the picture is worth keeping."""
@@ -105,7 +105,7 @@ def _judged(
     moved = last is None or last.shape != corners.shape or float(np.nanmax(np.abs(corners - last))) > 1.0
     if moved or max(abs(rate) for rate in state.rates_frd_rad_s) > STILL_RAD_S:
         return corners, "hold the vehicle still"
-    if any(np.linalg.norm(rotvec_from_R(other.T @ R)) < OTHERWISE_RAD for other in kept):
+    if any(np.linalg.norm(rotvec_from_R(other.T @ R)) < MIN_NEW_ROTATION_RAD for other in kept):
         return corners, "turn it otherwise: onto its sides, nose up and down, from the left and right"
     return corners, ""
 

@@ -1,6 +1,6 @@
-"""Camera and servo of a rig on the table: move the eyes, wait until they rest, take a pair.
+"""Camera and servo of a rig on the table: move the cameras, wait until they rest, take a pair.
 
-The eyes approach every baseline by shrinking, as in flight, so that the servo's play is always on the same side.
+The cameras approach every baseline by shrinking, as in flight, so that the servo's play is always on the same side.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class RigSession:
         return self._range_m
 
     async def place(self, nominal_m: float) -> None:
-        """Bring the eyes to a nominal baseline from above and wait until they rest there."""
+        """Bring the cameras to a nominal baseline from above and wait until they rest there."""
         if self._range_m[0] == self._range_m[1]:
             return
         above_m = min(nominal_m + OVERSHOOT_M, self._range_m[1])

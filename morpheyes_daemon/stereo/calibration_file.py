@@ -29,7 +29,7 @@ _HEADER = """\
 # T_cam0_cam1 takes points from the right camera's frame to the left one's (x right, y down, z forward).
 # Each pose belongs to a nominal baseline, what the servo is told; the true length is that of the translation.
 # Distortion is in the paper's order: radial k1, k2, k5, tangential k3, k4.
-# `mount` is the rotation vector of the left eye on the bar, where `morpheyes calibrate mount` has measured it.
+# `mount` is the rotation vector of the left camera on the bar, where `morpheyes calibrate mount` has measured it.
 # sha256 covers every value here: do not edit, calibrate again instead.
 """
 _REMEDY = "fetch it from a copy, or make it again with `morpheyes calibrate solve`"
@@ -158,11 +158,11 @@ def _rig(file: _File) -> RigModel:
         baselines=tuple(_baseline(part) for part in file.baselines),
         method=file.method,
         details=file.details,
-        mount=None if file.mount is None else _eye_mount(file.mount),
+        mount=None if file.mount is None else _camera_mount(file.mount),
     )
 
 
-def _eye_mount(part: _Mount) -> CameraMount:
+def _camera_mount(part: _Mount) -> CameraMount:
     return CameraMount(_radians(part.rotation_deg), _radians(part.sigma_deg))
 
 

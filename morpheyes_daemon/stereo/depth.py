@@ -22,7 +22,7 @@ from morpheyes_daemon.stereo.matching import Match, MatchSettings, disparity_ran
 from morpheyes_daemon.stereo.rectify import Rectification, Rectifier
 from morpheyes_daemon.stereo.rig import RigModel
 
-TALL_PX = 400
+ROW_STEP_MIN_HEIGHT_PX = 400
 """Image height from which every second row is enough: 640x480 so matched is still better than 320x240 in full."""
 
 
@@ -50,8 +50,8 @@ class DepthEstimator:
         self.config = config or StereoConfig()
         self.settings = settings or default_settings(self.rig.size[1])
 
-    def turned(self, rig: RigModel) -> DepthEstimator:
-        """Return an estimator for the same rig with an eye turned, at the size of the images."""
+    def with_rig(self, rig: RigModel) -> DepthEstimator:
+        """Return an estimator for the same rig with a camera turned, at the size of the images."""
         return DepthEstimator(rig, self.config, settings=self.settings)
 
     @property
@@ -122,8 +122,8 @@ class DepthEstimator:
 
 
 def default_settings(height: int) -> MatchSettings:
-    """Return how to match in flight: from TALL_PX rows on they are taken two by two, for half the time."""
-    return MatchSettings(row_step=2 if height >= TALL_PX else 1)
+    """Return how to match in flight: from ROW_STEP_MIN_HEIGHT_PX rows on they are taken two by two, for half the time."""
+    return MatchSettings(row_step=2 if height >= ROW_STEP_MIN_HEIGHT_PX else 1)
 
 
 def depth_from_disparity(disparity_px: FloatMap, baseline_m: float, f_px: float, doffs_px: float = 0.0) -> FloatMap:
@@ -170,7 +170,7 @@ def depth_sigma(
 ) -> float | NDArray[Any]:
     """Return one sigma of a depth, metres: eps_z = z^2 eps_d / (b f) (paper, section II) and what else moves it.
 
-    A baseline wrong by a share moves the depth by that share; a yaw between the eyes moves the disparity by f per
+    A baseline wrong by a share moves the depth by that share; a yaw between the cameras moves the disparity by f per
     radian. The three are independent and added in squares.
     """
     error_px = math.hypot(sigma_disparity_px, f_px * yaw_sigma_rad)

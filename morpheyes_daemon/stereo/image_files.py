@@ -13,7 +13,7 @@ from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.stereo.colours import UNKNOWN_BGR, colour_depth
 from morpheyes_daemon.stereo.still import StillDepth, halves
 
-NEAR_BGR, ONE_EYED_BGR = (235, 235, 235), (96, 84, 78)
+NEAR_BGR, HALF_OCCLUDED_BGR = (235, 235, 235), (96, 84, 78)
 INK, GREY = "#30343a", "#888888"
 WIDTH_IN, DPI = 9.0, 150
 
@@ -72,7 +72,7 @@ def draw_depth(path: Path, depth: StillDepth, title: str) -> None:
     shares = [
         (UNKNOWN_BGR, "unknown", np.isnan(depth.depth_m) & ~depth.near & ~depth.half_occluded),
         (NEAR_BGR, f"nearer than {depth.near_limit_m:.2f} m", depth.near),
-        (ONE_EYED_BGR, "only the left eye sees it", depth.half_occluded),
+        (HALF_OCCLUDED_BGR, "only the left camera sees it", depth.half_occluded),
     ]
     handles = [
         Patch(facecolor=_hex(bgr), edgecolor=GREY, label=f"{label} ({100 * mask.mean():.1f} %)")
@@ -94,7 +94,7 @@ def _range(depth_m: FloatMap) -> tuple[float, float]:
 def _coloured(depth: StillDepth, near_m: float, far_m: float) -> Image:
     picture = colour_depth(depth.depth_m, near_m, far_m)
     picture[depth.near] = NEAR_BGR
-    picture[depth.half_occluded] = ONE_EYED_BGR
+    picture[depth.half_occluded] = HALF_OCCLUDED_BGR
     return picture
 
 

@@ -1,7 +1,7 @@
-"""Dense matching of a rectified pair: disparity, and for what is unknown whether it is near or seen by one eye only.
+"""Dense matching of a rectified pair: disparity, and for what is unknown whether it is near or seen by one camera only.
 
 Semi-global matching is OpenCV's (StereoSGBM, Hirschmüller 2008, three path directions), on images padded so that
-only what the right eye cannot see is lost. What is nearer than the largest disparity has no match at all, and the
+only what the right camera cannot see is lost. What is nearer than the largest disparity has no match at all, and the
 matcher then often invents a far one; so a coarse search over a longer range runs beside it, finds such regions and
 overrules the fine one there. The result does not depend on the number of threads.
 """
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import FloatMap, Image, Mask
 
-COARSE_TALL = 2
+COARSE_ROW_FACTOR = 2
 """Coarse pixels are so much taller than wide: half the time, and what is near is tall as well."""
 
 STEP = 16
@@ -61,7 +61,7 @@ class MatchSettings:
     left_right_px: int = 1
     speckle_per_image: float = 1 / 1200
     island_per_image: float = 1 / 400
-    island_shore: float = 0.8
+    island_unknown_share: float = 0.8
     row_step: int = 1
     coarse_width_px: int = 160
     coarse_range: float = 3.0
@@ -71,7 +71,7 @@ class MatchSettings:
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
     """disparity_px (H, W) float32, NaN unknown; near: unknown because nearer than `ceiling_px`; half_occluded: unknown
-    because only the left eye sees it."""
+    because only the left camera sees it."""
 
     disparity_px: FloatMap
     near: Mask
@@ -97,26 +97,28 @@ def match(
 ) -> Match:
     """Match rectified grey images (H, W) uint8 over [min_disparity, min_disparity + num_disparities).
 
-    `left_seen` and `right_seen` (H, W) mark the pixels that the eyes really cover. Raises InputError when the images
+    `left_seen` and `right_seen` (H, W) mark the pixels that the cameras really cover. Raises InputError when the images
     cannot be matched at all.
     """
     _require_pair(left, right, num_disparities)
     settings = settings or MatchSettings()
     shape, step = left.shape, settings.row_step
     ceiling = min_disparity + num_disparities
-    near = _too_near(left, right, min_disparity, num_disparities, settings)[::step][: shape[0] // step]
+    near = _beyond_ceiling(left, right, min_disparity, num_disparities, settings)[::step][: shape[0] // step]
     if step > 1:
-        left, right = _shrunk(left, 1, step), _shrunk(right, 1, step)
+        left, right = _downsampled(left, 1, step), _downsampled(right, 1, step)
     speckle_px = round(left.size * settings.speckle_per_image)
     disparity = semi_global(left, right, min_disparity, num_disparities, settings, speckle_px)
     near |= disparity > ceiling - 1.5
     disparity[near] = np.nan
     left_seen, right_seen = (_rows_of(seen, step) for seen in (left_seen, right_seen))
-    _forget_unseen(disparity, near, left_seen, right_seen)
-    _forget_islands(disparity, round(left.size * settings.island_per_image), settings.island_shore)
+    _remove_unseen(disparity, near, left_seen, right_seen)
+    _remove_islands(disparity, round(left.size * settings.island_per_image), settings.island_unknown_share)
     half_occluded = _half_occluded(disparity, near, ceiling)
     if step > 1:
-        disparity, near, half_occluded = (_grown(array, 1, step, shape) for array in (disparity, near, half_occluded))
+        disparity, near, half_occluded = (
+            _upsampled(array, 1, step, shape) for array in (disparity, near, half_occluded)
+        )
     return Match(disparity, near, half_occluded, float(ceiling))
 
 
@@ -137,7 +139,7 @@ def semi_global(left: Image, right: Image, low: int, count: int, settings: Match
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
     before, after = max(0, low + count), max(0, -low)
-    padded = [cv2.copyMakeBorder(eye, 0, 0, before, after, cv2.BORDER_REPLICATE) for eye in (left, right)]
+    padded = [cv2.copyMakeBorder(side, 0, 0, before, after, cv2.BORDER_REPLICATE) for side in (left, right)]
     fixed = np.asarray(matcher.compute(*padded), dtype=np.int16)[:, before : before + left.shape[1]]
     disparity = fixed.astype(np.float32) / np.float32(SUBPIXELS) + _CORRECTION_PX[fixed & (SUBPIXELS - 1)]
     column = np.arange(left.shape[1], dtype=np.float32)
@@ -145,25 +147,25 @@ def semi_global(left: Image, right: Image, low: int, count: int, settings: Match
     return np.asarray(disparity)
 
 
-def _too_near(left: Image, right: Image, low: int, count: int, settings: MatchSettings) -> Mask:
+def _beyond_ceiling(left: Image, right: Image, low: int, count: int, settings: MatchSettings) -> Mask:
     """Return where a coarse search over a longer range prefers a disparity beyond the fine search's ceiling."""
     height, width = left.shape
     scale = max(1, round(width / settings.coarse_width_px))
-    small_left, small_right = (_shrunk(eye, scale, COARSE_TALL * scale) for eye in (left, right))
+    small_left, small_right = (_downsampled(side, scale, COARSE_ROW_FACTOR * scale) for side in (left, right))
     reach = disparity_range(count * settings.coarse_range / scale, small_left.shape[1])
     coarse = semi_global(small_left, small_right, low // scale, reach, settings, settings.coarse_speckle_px)
     beyond = coarse * scale > low + count + scale / 2
-    return _grown(beyond, scale, COARSE_TALL * scale, (height, width))
+    return _upsampled(beyond, scale, COARSE_ROW_FACTOR * scale, (height, width))
 
 
-def _shrunk(image: Image, across: int, down: int) -> Image:
+def _downsampled(image: Image, across: int, down: int) -> Image:
     height, width = image.shape
     rows, columns = height // down, width // across
     cut = image[: rows * down, : columns * across]
     return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
-def _grown(small: NDArray[Any], across: int, down: int, shape: tuple[int, ...]) -> NDArray[Any]:
+def _upsampled(small: NDArray[Any], across: int, down: int, shape: tuple[int, ...]) -> NDArray[Any]:
     """Return `small` with every pixel repeated; what is left over at the right and bottom repeats the edge."""
     drawn = small.view(np.uint8) if small.dtype == np.bool_ else small
     size = (small.shape[1] * across, small.shape[0] * down)
@@ -177,12 +179,12 @@ def _rows_of(seen: Mask | None, step: int) -> Mask | None:
     return None if seen is None else seen[::step][: seen.shape[0] // step]
 
 
-def _forget_unseen(disparity: FloatMap, near: Mask, left_seen: Mask | None, right_seen: Mask | None) -> None:
+def _remove_unseen(disparity: FloatMap, near: Mask, left_seen: Mask | None, right_seen: Mask | None) -> None:
     if left_seen is not None:
         disparity[~left_seen] = np.nan
         near &= left_seen
     if right_seen is not None:
-        # what an eye sees of a rectified row is one piece
+        # what a camera sees of a rectified row is one piece
         width = right_seen.shape[1]
         first = right_seen.argmax(axis=1)
         last = np.where(right_seen.any(axis=1), width - 1 - right_seen[:, ::-1].argmax(axis=1), -1)
@@ -190,7 +192,7 @@ def _forget_unseen(disparity: FloatMap, near: Mask, left_seen: Mask | None, righ
         disparity[(partner < first[:, None] - 0.5) | (partner > last[:, None] + 0.5)] = np.nan
 
 
-def _forget_islands(disparity: FloatMap, largest_px: int, shore: float) -> None:
+def _remove_islands(disparity: FloatMap, largest_px: int, shore: float) -> None:
     """Forget small patches of disparity in a sea of unknown: where nothing can match, something always seems to.
 
     A patch goes when more than the share `shore` of its neighbours is unknown; a thin branch stays, since on one side
@@ -220,9 +222,9 @@ def _neighbours(labels: NDArray[Any], unknown: Mask) -> Iterator[tuple[NDArray[A
 
 
 def _half_occluded(disparity: FloatMap, near: Mask, ceiling: float) -> Mask:
-    """Return where something nearer hides an unknown pixel from the right eye, or the image's edge does.
+    """Return where something nearer hides an unknown pixel from the right camera, or the image's edge does.
 
-    Seen from the right eye a nearer surface with disparity d_f covers d_f - d_b pixels of the background (d_b) left
+    Seen from the right camera a nearer surface with disparity d_f covers d_f - d_b pixels of the background (d_b) left
     of its own left edge; at the image's edge d_f pixels are missing. What lies left of something too near may well
     belong to it, so nothing is said about that.
     """

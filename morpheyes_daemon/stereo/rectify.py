@@ -1,6 +1,6 @@
-"""Rectification for a baseline that changes all the time: parallel eyes, common camera matrix, rows that align.
+"""Rectification for a baseline that changes all the time: parallel cameras, common camera matrix, rows that align.
 
-R_rect follows the paper (section II); both eyes are re-projected with one common K_rect, without which rows would
+R_rect follows the paper (section II); both cameras are re-projected with one common K_rect, without which rows would
 not align when the lenses differ. Maps are computed on a coarse grid in double precision and spread linearly, which
 stays within 0.01 px and makes a new baseline cheap. Nothing here looks at what the images show.
 """
@@ -23,15 +23,15 @@ WIDE_GRID_PX, NARROW_GRID_PX, WIDE_FROM_PX = 8, 4, 480
 """Steps of the coarse grid; a lens with k1 = -0.3 and a 47 degree view bends by less than 0.01 px within one."""
 
 QUANTUM_M = 0.25e-3
-"""Baselines nearer than this share their maps: the pose between the eyes does not change visibly over it."""
+"""Baselines nearer than this share their maps: the pose between the cameras does not change visibly over it."""
 
 CACHED = 8
 """Rectifications kept; one at 640x480 takes 5 MB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RectifiedEye:
-    """How one eye's raw image becomes the rectified one.
+class RectifiedCamera:
+    """How one camera's raw image becomes the rectified one.
 
     `map_px` (H, W, 2) float32 gives the raw pixel of every rectified one; `seen` (H, W) bool is False where the raw
     image does not reach, None where it reaches everywhere.
@@ -61,13 +61,13 @@ class RectifiedEye:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectification:
-    """Both eyes rectified for one baseline. `baseline_m` is the true length at the nominal one."""
+    """Both cameras rectified for one baseline. `baseline_m` is the true length at the nominal one."""
 
     nominal_m: float
     baseline_m: float
     pinhole: Pinhole
-    cam0: RectifiedEye
-    cam1: RectifiedEye
+    cam0: RectifiedCamera
+    cam1: RectifiedCamera
     T_rig_rect: Array
 
     @property
@@ -114,8 +114,8 @@ def rectify(rig: RigModel, baseline_m: float) -> Rectification:
         nominal_m=baseline_m,
         baseline_m=length_m,
         pinhole=pinhole,
-        cam0=_rectified_eye(rig.cam0, R_rect_cam0, pinhole),
-        cam1=_rectified_eye(rig.cam1, R_rect_cam1, pinhole),
+        cam0=_rectified_camera(rig.cam0, R_rect_cam0, pinhole),
+        cam1=_rectified_camera(rig.cam1, R_rect_cam1, pinhole),
         T_rig_rect=frozen(T_rig_cam0 @ inverse(pose(R_rect_cam0, np.zeros(3)))),
     )
 
@@ -133,7 +133,7 @@ def rectifying_rotation(t_cam0_cam1: Array) -> Array:
 
 
 def common_pinhole(rig: RigModel, R_rect_cam0: Array, R_rect_cam1: Array) -> Pinhole:
-    """Return K_rect: the mean focal length, and the middle of what both eyes see in the middle of the image."""
+    """Return K_rect: the mean focal length, and the middle of what both cameras see in the middle of the image."""
     width, height = rig.size
     f_px = (rig.cam0.fx + rig.cam0.fy + rig.cam1.fx + rig.cam1.fy) / 4
     views = np.stack([_view(rig.cam0, R_rect_cam0), _view(rig.cam1, R_rect_cam1)])
@@ -178,16 +178,16 @@ def _view(camera: CameraIntrinsics, R_rect_cam: Array) -> Array:
         raise CalibrationError("The lens distortion folds back within the image; calibrate the camera again.")
     turned = homogeneous(xy) @ R_rect_cam.T
     if np.any(turned[:, 2] <= 0.1):
-        raise CalibrationError("The eyes point so far apart that no common view is left; calibrate the rig again.")
+        raise CalibrationError("The cameras point so far apart that no common view is left; calibrate the rig again.")
     turned = turned[:, :2] / turned[:, 2:]
     return np.stack([turned.min(axis=0), turned.max(axis=0)])
 
 
-def _rectified_eye(camera: CameraIntrinsics, R_rect_cam: Array, pinhole: Pinhole) -> RectifiedEye:
+def _rectified_camera(camera: CameraIntrinsics, R_rect_cam: Array, pinhole: Pinhole) -> RectifiedCamera:
     raw, inset = _coarse_map(camera, R_rect_cam, pinhole)
     map_px = _spread(raw, pinhole)
     seen = None if inset.min() >= 0 else frozen(_spread(inset, pinhole) >= 0)
-    return RectifiedEye(camera, frozen(R_rect_cam.copy()), pinhole, frozen(map_px), seen)
+    return RectifiedCamera(camera, frozen(R_rect_cam.copy()), pinhole, frozen(map_px), seen)
 
 
 def _coarse_map(camera: CameraIntrinsics, R_rect_cam: Array, pinhole: Pinhole) -> tuple[FloatMap, FloatMap]:

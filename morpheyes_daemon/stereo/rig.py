@@ -2,7 +2,7 @@
 
 Poses are known at a few baselines and interpolated by ScLERP between neighbours (paper, section III-B). The
 parameter is the *nominal* baseline, what the servo was told or is modelled to have reached; the true distance
-between the eyes comes out of the pose, so that a servo that is not linear is calibrated out. How the poses were
+between the cameras comes out of the pose, so that a servo that is not linear is calibrated out. How the poses were
 found is the calibration's business, how the file looks that of `calibration_file`.
 """
 
@@ -32,10 +32,10 @@ METHODS = ("solved", "exact")
 
 @dataclass(frozen=True)
 class CalibratedBaseline:
-    """Pose between the eyes at one nominal baseline; what the calibration could not tell is None.
+    """Pose between the cameras at one nominal baseline; what the calibration could not tell is None.
 
     `q_cam0_cam1` (w, x, y, z) and `t_cam0_cam1_m` take cam1 coordinates to cam0. `sigma_length_m` and
-    `sigma_yaw_rad` are one standard deviation of the solved length and of the yaw between the eyes.
+    `sigma_yaw_rad` are one standard deviation of the solved length and of the yaw between the cameras.
     """
 
     nominal_m: float
@@ -60,7 +60,7 @@ class CalibratedBaseline:
 
 @dataclass(frozen=True)
 class CameraMount:
-    """How the left eye is turned on the bar: rotation vector R_rig_cam0 and one sigma of it, radians, camera axes."""
+    """How the left camera is turned on the bar: rotation vector R_rig_cam0 and one sigma of it, radians, camera axes."""
 
     rotation_rad: tuple[float, float, float]
     sigma_rad: tuple[float, float, float]
@@ -68,9 +68,9 @@ class CameraMount:
 
 @dataclass(frozen=True)
 class RigModel:
-    """Intrinsics of both eyes and the pose between them over the calibrated range of baselines.
+    """Intrinsics of both cameras and the pose between them over the calibrated range of baselines.
 
-    `method` is "solved" (from images) or "exact" (known, a simulator's truth). Boards do not tell how the eyes sit on
+    `method` is "solved" (from images) or "exact" (known, a simulator's truth). Boards do not tell how the cameras sit on
     the vehicle: without a `mount` the left one is taken for straight on the bar. `details` is plain data for people
     and reports: board, date, coverage, uncertainty per parameter; it is kept in the file and not used for geometry.
     """
@@ -95,7 +95,7 @@ class RigModel:
         for baseline in self.baselines:
             _check(baseline)
         if self.mount is not None and not np.all(np.isfinite([*self.mount.rotation_rad, *self.mount.sigma_rad])):
-            raise CalibrationError("The left eye's rotation on the bar is not finite.")
+            raise CalibrationError("The left camera's rotation on the bar is not finite.")
 
     @classmethod
     def from_poses(
@@ -114,7 +114,7 @@ class RigModel:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Image size (width, height) of both eyes in pixels."""
+        """Image size (width, height) of both cameras in pixels."""
         return self.cam0.width, self.cam0.height
 
     @cached_property
@@ -129,16 +129,16 @@ class RigModel:
 
     @property
     def origin(self) -> str:
-        """How the file came about: its method, or "mounted" where the eyes' mount was measured as well."""
+        """How the file came about: its method, or "mounted" where the cameras' mount was measured as well."""
         return self.method if self.mount is None else "mounted"
 
     @property
     def R_rig_cam0(self) -> Array:
-        """The left eye's rotation (3, 3) on the bar; none where it was not measured."""
+        """The left camera's rotation (3, 3) on the bar; none where it was not measured."""
         return np.eye(3) if self.mount is None else R_from_rotvec(np.array(self.mount.rotation_rad))
 
     def T_cam0_cam1(self, baseline_m: float) -> Array:
-        """Return the pose (4, 4) of the right eye in the left at a nominal baseline; see `dual_quaternion`."""
+        """Return the pose (4, 4) of the right camera in the left at a nominal baseline; see `dual_quaternion`."""
         return pose_from_dual_quaternion(self.dual_quaternion(baseline_m))
 
     def dual_quaternion(self, baseline_m: float) -> Array:
@@ -153,7 +153,7 @@ class RigModel:
         return sclerp(self.baselines[i].dual_quaternion, self.baselines[i + 1].dual_quaternion, t)
 
     def length_m(self, baseline_m: float) -> float:
-        """Return the true distance between the eyes at a nominal baseline."""
+        """Return the true distance between the cameras at a nominal baseline."""
         return float(np.linalg.norm(self.T_cam0_cam1(baseline_m)[:3, 3]))
 
     def sigma_length_m(self, baseline_m: float) -> float:
@@ -161,7 +161,7 @@ class RigModel:
         return self._interpolated([b.sigma_length_m for b in self.baselines], baseline_m)
 
     def sigma_yaw_rad(self, baseline_m: float) -> float:
-        """Return the calibration's own sigma of the yaw between the eyes, 0 where it does not state one."""
+        """Return the calibration's own sigma of the yaw between the cameras, 0 where it does not state one."""
         return self._interpolated([b.sigma_yaw_rad for b in self.baselines], baseline_m)
 
     def rescaled(self, width: int, height: int) -> RigModel:
@@ -197,4 +197,4 @@ def _check(baseline: CalibratedBaseline) -> None:
     if abs(np.linalg.norm(baseline.q_cam0_cam1) - 1.0) > 1e-6:
         raise CalibrationError(f"{name} has a rotation that is no unit quaternion.")
     if baseline.t_cam0_cam1_m[0] <= 0:
-        raise CalibrationError(f"{name} puts the right eye left of the left one; were the images swapped?")
+        raise CalibrationError(f"{name} puts the right camera left of the left one; were the images swapped?")

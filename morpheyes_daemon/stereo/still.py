@@ -114,5 +114,5 @@ def halves(picture: Image) -> tuple[Image, Image]:
 def require_same_size(left: Image, right: Image) -> None:
     """Raise InputError when two pictures are not of the same size."""
     if left.shape[:2] != right.shape[:2]:
-        sizes = [f"{eye.shape[1]}x{eye.shape[0]}" for eye in (left, right)]
+        sizes = [f"{side.shape[1]}x{side.shape[0]}" for side in (left, right)]
         raise InputError(f"The left picture is {sizes[0]} px, the right one {sizes[1]} px; both must be the same size.")

@@ -31,7 +31,7 @@ INTRINSIC = ("f", "alpha", "k1", "k2", "k3", "k5")
 SWEPT = (*INTRINSIC, "k4")
 """What figure 2 is drawn for: the table's columns, and k4, which the paper leaves out since it mirrors k3."""
 EXTRINSIC = ("T", "phi", "theta", "psi")
-"""The columns of table I. T is T_x; phi, theta, psi turn about x, y, z of the right eye."""
+"""The columns of table I. T is T_x; phi, theta, psi turn about x, y, z of the right camera."""
 
 NOMINAL: Mapping[str, float] = {"alpha": 1e-3, "k1": -0.1, "k2": 0.02, "k3": 1e-3, "k4": 1e-3, "k5": 5e-3}
 """What errors are percent of, since the paper does not say; table I does not depend on it."""
@@ -47,8 +47,8 @@ ERROR_DEG = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class EyePair:
-    """Two eyes to be analysed: lenses and the pose R, T of the paper (right eye from left: R_cam1_cam0, t in m)."""
+class CameraPair:
+    """Two cameras to be analysed: lenses and the pose R, T of the paper (right camera from left: R_cam1_cam0, t in m)."""
 
     cam0: CameraIntrinsics
     cam1: CameraIntrinsics
@@ -71,16 +71,16 @@ def paper_lens(focal_mm: float) -> CameraIntrinsics:
     return CameraIntrinsics(WIDTH_PX, WIDTH_PX, f_px, f_px, middle, middle)
 
 
-def paper_pair(focal_mm: float) -> EyePair:
+def paper_pair(focal_mm: float) -> CameraPair:
     """Return the paper's rig for extrinsic errors: R = I, T = (200, 2, 2) mm (paper-notes 3), no distortion."""
     lens = paper_lens(focal_mm)
-    return EyePair(lens, lens, np.eye(3), np.array([0.200, 0.002, 0.002]))
+    return CameraPair(lens, lens, np.eye(3), np.array([0.200, 0.002, 0.002]))
 
 
-def rig_pair(rig: RigModel, baseline_m: float) -> EyePair:
+def rig_pair(rig: RigModel, baseline_m: float) -> CameraPair:
     """Return a calibrated rig at a nominal baseline."""
     T_cam0_cam1 = rig.T_cam0_cam1(baseline_m)
-    return EyePair(rig.cam0, rig.cam1, T_cam0_cam1[:3, :3].T, T_cam0_cam1[:3, 3])
+    return CameraPair(rig.cam0, rig.cam1, T_cam0_cam1[:3, :3].T, T_cam0_cam1[:3, 3])
 
 
 def intrinsic_error(lens: CameraIntrinsics, name: str, error_pct: float) -> PixelError:
@@ -94,7 +94,7 @@ def intrinsic_error(lens: CameraIntrinsics, name: str, error_pct: float) -> Pixe
     return _largest(wrong.pixels_from_normalised(xy) - right.pixels_from_normalised(xy))
 
 
-def extrinsic_error(pair: EyePair, name: str, error: float) -> tuple[PixelError, PixelError]:
+def extrinsic_error(pair: CameraPair, name: str, error: float) -> tuple[PixelError, PixelError]:
     """Return the errors in the left and the right rectified image.
 
     `error` is percent for T (that is T_x; T_y and T_z act alike), degrees for phi, theta, psi (R wrong by R_e).
@@ -110,7 +110,7 @@ def extrinsic_error(pair: EyePair, name: str, error: float) -> tuple[PixelError,
     return _largest(wrong[0] - true[0]), _largest(wrong[1] - true[1])
 
 
-def table_1(lens: CameraIntrinsics, pair: EyePair) -> dict[str, object]:
+def table_1(lens: CameraIntrinsics, pair: CameraPair) -> dict[str, object]:
     """Return table I: e_y / e_x per intrinsic number, left / right error per extrinsic one, in x and in y."""
     intrinsic = {}
     for name in INTRINSIC:
@@ -154,7 +154,7 @@ def _ideal_grid(lens: CameraIntrinsics) -> Array:
     return np.stack(np.meshgrid((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy), axis=-1)
 
 
-def _rectified(pair: EyePair, R_cam1_cam0: Array, t_cam0_cam1: Array) -> tuple[Array, Array]:
+def _rectified(pair: CameraPair, R_cam1_cam0: Array, t_cam0_cam1: Array) -> tuple[Array, Array]:
     """Return the rectified pixels of every pixel of the left and the right image."""
     R_rect = rectifying_rotation(t_cam0_cam1)
     left = _turned(pair.cam0, R_rect)

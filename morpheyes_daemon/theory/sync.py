@@ -1,6 +1,6 @@
-"""How far and how fast a rig may move before the time between its eyes costs more than k pixels (paper, section II).
+"""How far and how fast a rig may move before the time between its cameras costs more than k pixels (paper, section II).
 
-The right eye exposes dt after the left one, from where the rig is by then. The paper gives the case of moving away
+The right camera exposes dt after the left one, from where the rig is by then. The paper gives the case of moving away
 from a point on the optical axis; paper-notes 4 derives the others. Pure formulas: distances v dt first, speeds after.
 """
 
@@ -43,7 +43,7 @@ def sync_speed_bound_m_s(
 ) -> float:
     """Return the largest speed in any direction that keeps the disparity error within `k_px` over the whole image.
 
-    No time between the eyes means no bound.
+    No time between the cameras means no bound.
     """
     if dt_s <= 0.0:
         return math.inf

@@ -1,8 +1,8 @@
 """The depth error to expect at each baseline and distance, split into what causes it.
 
 Everything goes through eps_z = z^2 eps_d / (b f) (paper, section II): the matcher's noise, the disparity bias that
-the yaw between the eyes leaves, the error of the baseline's length (Z sigma_b / b), and what the eyes' time offset
-adds while the vehicle moves sideways (the eyes then see the scene from b + v dt).
+the yaw between the cameras leaves, the error of the baseline's length (Z sigma_b / b), and what the cameras' time offset
+adds while the vehicle moves sideways (the cameras then see the scene from b + v dt).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ DISTANCES_M = (1.0, 2.0, 5.0, 10.0)
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the calibration cannot know: matcher noise, servo repeatability, time between the eyes, sideways speed."""
+    """What the calibration cannot know: matcher noise, servo repeatability, time between the cameras, sideways speed."""
 
     sigma_disparity_px: float = 0.25
     sigma_servo_m: float = 1e-4

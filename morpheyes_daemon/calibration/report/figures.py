@@ -32,21 +32,21 @@ def calibrated(rig: RigModel) -> list[CalibratedBaseline]:
 
 
 def coverage_map(rig: RigModel) -> Figure | None:
-    """Where in each eye's image corners were seen."""
+    """Where in each camera's image corners were seen."""
     seen = rig.details.get("coverage")
     if not seen:
         return None
     figure = Figure(figsize=_WIDE, layout="constrained")
     axes = figure.subplots(1, 2)
     most = max(np.max(seen["left"]), np.max(seen["right"]), 1)
-    for ax, eye in zip(axes, ("left", "right"), strict=True):
-        counts = np.array(seen[eye])
+    for ax, side in zip(axes, ("left", "right"), strict=True):
+        counts = np.array(seen[side])
         shown = np.where(counts > 0, counts, np.nan)
         image = _cells(ax, shown, rig, "YlGnBu", 0, float(most))
         for row, column in np.argwhere(counts == 0):
             at = _cell_centre(rig, counts.shape, row, column)
             ax.text(*at, "none", ha="center", va="center", color=RED, size=8)
-        ax.set_title(f"{eye} eye: {np.mean(counts > 0):.0%} of the image", loc="left")
+        ax.set_title(f"{side} camera: {np.mean(counts > 0):.0%} of the image", loc="left")
     _bar_of_colours(figure, image, axes, "corners seen")
     return figure
 
@@ -114,7 +114,7 @@ def leave_one_out_curve(rig: RigModel) -> Figure | None:
 
 
 def rail_curves(rig: RigModel) -> Figure | None:
-    """What the eyes do besides moving apart: angles and offsets along the rail."""
+    """What the cameras do besides moving apart: angles and offsets along the rail."""
     if len(rig.baselines) < 2:
         return None
     figure = Figure(figsize=_WIDE, layout="constrained")
@@ -137,8 +137,8 @@ def rail_curves(rig: RigModel) -> Figure | None:
             ax.plot(b[known] * 1e3, values[known, column], "o", color=colour, ms=4)
         ax.set_xlabel("nominal baseline, mm")
     axes[0].set_title("true length minus nominal, mm", loc="left")
-    axes[1].set_title("right eye against left, degrees", loc="left")
-    axes[2].set_title("right eye's offset, mm", loc="left")
+    axes[1].set_title("right camera against left, degrees", loc="left")
+    axes[2].set_title("right camera's offset, mm", loc="left")
     for ax in axes[1:]:
         ax.legend()
     return figure
@@ -222,6 +222,6 @@ def _cell_centre(rig: RigModel, shape: tuple[int, ...], row: int, column: int) -
 
 
 def _angles(R_cam0_cam1: Any) -> tuple[float, float, float]:
-    """Return pitch (about x), yaw (about y, to the right) and roll (about z) of the right eye in the left, rad."""
+    """Return pitch (about x), yaw (about y, to the right) and roll (about z) of the right camera in the left, rad."""
     roll, pitch, yaw = rpy_from_R(R_FRD_CAM @ R_cam0_cam1 @ R_FRD_CAM.T)
     return pitch, yaw, roll

@@ -83,7 +83,7 @@ def report_html(rig: RigModel, conditions: Conditions) -> str:
         _section("Where boards were seen", _COVERAGE, figures.coverage_map(rig)),
         _section("Baselines", "", None, _baseline_table(rig)),
         _section("Cameras", "", None, _camera_table(rig)),
-        _section("Pictures set aside", "", None, _aside(rig)),
+        _section("Pictures set aside", "", None, _set_aside(rig)),
     ]
     return (
         f"<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
@@ -118,16 +118,16 @@ def report_png(rig: RigModel, conditions: Conditions) -> bytes:
 
 
 _FIT = "Distance between corners seen and those the solved rig predicts, and how far rows differ on held-out boards."
-_HELD_OUT = "After rectification a corner should lie on the same row in both eyes. Boards were left out in turn."
+_HELD_OUT = "After rectification a corner should lie on the same row in both cameras. Boards were left out in turn."
 _LEFT_OUT = "Each inner baseline is left out and predicted by the others: what the rig is worth in between."
-_RAIL = "How the right eye stands to the left one. Dots were calibrated; lines are what the daemon uses in between."
+_RAIL = "How the right camera stands to the left one. Dots were calibrated; lines are what the daemon uses in between."
 _COVERAGE = "Corners counted over the image. A lens is only known where boards were seen."
 
 
 def _depth_text(conditions: Conditions) -> str:
     return (
         f"One sigma, for a matcher that is good to {conditions.sigma_disparity_px:g} px, a servo that repeats to "
-        f"{conditions.sigma_servo_m * 1e3:g} mm, eyes {conditions.sync_s * 1e3:g} ms apart and "
+        f"{conditions.sigma_servo_m * 1e3:g} mm, cameras {conditions.sync_s * 1e3:g} ms apart and "
         f"{conditions.sideways_m_s:g} m/s sideways. Colours are shares of the variance; percent of the distance."
     )
 
@@ -187,7 +187,7 @@ def _scale(rig: RigModel) -> str:
     board = rig.details["board"]["square_mm"]
     rows = [
         ("squares as told", f"{board:.3f} mm"),
-        ("squares triangulated from both eyes", f"{scale['square_mm']:.3f} ± {scale['square_scatter_mm']:.3f} mm"),
+        ("squares triangulated from both cameras", f"{scale['square_mm']:.3f} ± {scale['square_scatter_mm']:.3f} mm"),
     ]
     if scale.get("length_ratio") is not None:
         rows.append(("solved lengths against the folders' names", f"× {scale['length_ratio']:.4f}"))
@@ -228,13 +228,13 @@ def _camera_table(rig: RigModel) -> str:
 
 def _with_sigma(name: str, values: list[float], sigma: Any) -> tuple[str, str, str, str]:
     shown = []
-    for value, eye in zip(values, ("cam0", "cam1"), strict=True):
-        known = sigma.get(eye, {}).get(name)
+    for value, side in zip(values, ("cam0", "cam1"), strict=True):
+        known = sigma.get(side, {}).get(name)
         shown += [f"{value:.5g}" if abs(value) < 10 else f"{value:.3f}", "" if known is None else f"± {known:.2g}"]
     return shown[0], shown[1], shown[2], shown[3]
 
 
-def _aside(rig: RigModel) -> str:
+def _set_aside(rig: RigModel) -> str:
     outliers = rig.details.get("outliers", [])
     problems = rig.details.get("problems", [])
     rows = [(str(outlier["file"]), f"does not fit: {outlier['rms_px']:.2f} px") for outlier in outliers]

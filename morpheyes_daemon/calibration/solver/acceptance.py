@@ -26,7 +26,7 @@ _LEFT_OUT_FLOOR_PX = 0.05
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Acceptance:
     """`text` begins with "fit to fly", "fly with care" or "do not fly"; `retake` says what would make it better."""
 
     text: str
@@ -40,18 +40,18 @@ def judge(
     uncertainty: list[BaselineUncertainty],
     scale: ScaleCheck,
     lost: tuple[str, ...],
-) -> Verdict:
+) -> Acceptance:
     """Return the verdict on a calibration from its figures; `lost` says which baselines could not be used at all."""
     fatal = _fatal(calibration, held_out, scale)
     advice = [*_views(calibration), *_cells(calibration), *_yaw(calibration, uncertainty), *_rail(left_out)]
     retake = tuple([*fatal, *lost, *advice])
     if fatal:
-        return Verdict(f"do not fly: {fatal[0]}", retake)
+        return Acceptance(f"do not fly: {fatal[0]}", retake)
     if held_out.p95_px > HELD_OUT_GOOD_PX:
-        return Verdict(f"fly with care: rows of held-out boards differ by {held_out.p95_px:.2f} px (95 %)", retake)
+        return Acceptance(f"fly with care: rows of held-out boards differ by {held_out.p95_px:.2f} px (95 %)", retake)
     if advice or lost:
-        return Verdict(f"fly with care: {retake[0]}", retake)
-    return Verdict(f"fit to fly: rows of held-out boards agree within {held_out.p95_px:.2f} px (95 %)", retake)
+        return Acceptance(f"fly with care: {retake[0]}", retake)
+    return Acceptance(f"fit to fly: rows of held-out boards agree within {held_out.p95_px:.2f} px (95 %)", retake)
 
 
 def _fatal(calibration: Calibration, held_out: HeldOut, scale: ScaleCheck) -> list[str]:
@@ -88,12 +88,12 @@ def _views(calibration: Calibration) -> list[str]:
 def _cells(calibration: Calibration) -> list[str]:
     seen = coverage(calibration.observations)
     advice = []
-    for eye, counts in (("left", seen.left), ("right", seen.right)):
+    for side, counts in (("left", seen.left), ("right", seen.right)):
         empty = empty_corners(counts)
         if empty or np.mean(counts > 0) < _LEAST_COVERAGE:
             where = " and ".join(empty) or "border"
             advice.append(
-                f"boards cover {np.mean(counts > 0):.0%} of the {eye} image: show one in the {where} of the picture"
+                f"boards cover {np.mean(counts > 0):.0%} of the {side} image: show one in the {where} of the picture"
             )
     return advice
 

@@ -1,6 +1,6 @@
 """One least-squares problem for everything a rig's boards tell: sparse Levenberg-Marquardt with a Schur complement.
 
-Unknown are the two cameras (shared by all baselines), the pose between the eyes at each baseline, and the board's
+Unknown are the two cameras (shared by all baselines), the pose between the cameras at each baseline, and the board's
 pose in each view. A view touches 20 + 6 + 6 of them, so the normal equations are small dense blocks per view; the
 board poses are eliminated first (Triggs et al., "Bundle adjustment: a modern synthesis", 2000, section 6) and a
 system of 20 + 6 M unknowns remains. What is known beforehand enters as a quadratic on those. This module knows
@@ -19,9 +19,9 @@ from morpheyes_daemon.calibration.solver.projection import project
 from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.transforms import Array, R_from_rotvec, skew
 
-EYES = 20
-"""Unknowns of the two cameras; the poses between the eyes follow, six per baseline (rotation vector, metres)."""
-POSE = 6
+CAMERA_UNKNOWNS = 20
+"""Unknowns of the two cameras; the poses between the cameras follow, six per baseline (rotation vector, metres)."""
+POSE_UNKNOWNS = 6
 HUBER_SIGMAS = 3.0
 _STEPS = 60
 _FLAT = 1e-9
@@ -31,12 +31,12 @@ _DAMPING_LIMIT = 1e12
 
 @dataclass(frozen=True, eq=False)
 class RigState:
-    """Values of all unknowns: `eyes` (2, 10), `between` (M, 6), board poses T_cam0_board as R (V, 3, 3), t (V, 3).
+    """Values of all unknowns: `cameras` (2, 10), `between` (M, 6), board poses T_cam0_board as R (V, 3, 3), t (V, 3).
 
     `between` is T_cam0_cam1 as rotation vector (rad) and translation (m).
     """
 
-    eyes: Array
+    cameras: Array
     between: Array
     R_cam0_board: Array
     t_cam0_board_m: Array
@@ -44,7 +44,7 @@ class RigState:
     @property
     def shared(self) -> Array:
         """The unknowns that views share (20 + 6 M,)."""
-        return np.concatenate([self.eyes.ravel(), self.between.ravel()])
+        return np.concatenate([self.cameras.ravel(), self.between.ravel()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +99,9 @@ def solve(observations: Observations, start: RigState, prior: Prior, sigma_px: f
 
 
 def residuals(observations: Observations, state: RigState) -> Array:
-    """Return seen minus predicted pixels (V, 2 eyes, N, 2), NaN where unseen."""
+    """Return seen minus predicted pixels (V, 2 cameras, N, 2), NaN where unseen."""
     p_cam0, p_cam1, *_ = _points(observations, state)
-    predicted = np.stack([project(p_cam0, state.eyes[0])[0], project(p_cam1, state.eyes[1])[0]], axis=1)
+    predicted = np.stack([project(p_cam0, state.cameras[0])[0], project(p_cam1, state.cameras[1])[0]], axis=1)
     return np.stack([observations.left, observations.right], axis=1) - predicted
 
 
@@ -144,9 +144,9 @@ def _linearise(observations: Observations, state: RigState, sigma_px: float) -> 
     transposed = np.swapaxes(matrix, 1, 2)
     normal, gradient = transposed @ matrix, (transposed @ rows)[..., 0]
     columns = _columns(observations.baseline)
-    size = EYES + POSE * len(state.between)
+    size = CAMERA_UNKNOWNS + POSE_UNKNOWNS * len(state.between)
     shared, shared_gradient = np.zeros((size, size)), np.zeros(size)
-    cut = EYES + POSE
+    cut = CAMERA_UNKNOWNS + POSE_UNKNOWNS
     np.add.at(shared, (columns[:, :, None], columns[:, None, :]), normal[:, :cut, :cut])
     np.add.at(shared_gradient, columns, gradient[:, :cut])
     return _System(
@@ -156,26 +156,28 @@ def _linearise(observations: Observations, state: RigState, sigma_px: float) -> 
 
 def _columns(baseline: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return which shared unknowns (V, 26) each view touches."""
-    eyes = np.broadcast_to(np.arange(EYES), (len(baseline), EYES))
-    return np.concatenate([eyes, EYES + POSE * baseline[:, None] + np.arange(POSE)], axis=1)
+    cameras = np.broadcast_to(np.arange(CAMERA_UNKNOWNS), (len(baseline), CAMERA_UNKNOWNS))
+    return np.concatenate(
+        [cameras, CAMERA_UNKNOWNS + POSE_UNKNOWNS * baseline[:, None] + np.arange(POSE_UNKNOWNS)], axis=1
+    )
 
 
 def _jacobian(observations: Observations, state: RigState) -> tuple[Array, Array]:
     """Return d predicted / d unknowns of a view (V, 2, N, 2, 32) and the residual (V, 2, N, 2), 0 where unseen."""
     p_cam0, p_cam1, arm, from_cam1 = _points(observations, state)
     views, corners = p_cam0.shape[:2]
-    jacobian = np.zeros((views, 2, corners, 2, EYES + 2 * POSE))
+    jacobian = np.zeros((views, 2, corners, 2, CAMERA_UNKNOWNS + 2 * POSE_UNKNOWNS))
     R_cam1_cam0, d_turn = _turning(state.between)
     R_cam1_cam0, d_turn = R_cam1_cam0[observations.baseline], d_turn[observations.baseline]
 
-    left, jacobian[:, 0, :, :, :10], d_left = project(p_cam0, state.eyes[0])
-    right, jacobian[:, 1, :, :, 10:20], d_right = project(p_cam1, state.eyes[1])
+    left, jacobian[:, 0, :, :, :10], d_left = project(p_cam0, state.cameras[0])
+    right, jacobian[:, 1, :, :, 10:20], d_right = project(p_cam1, state.cameras[1])
     d_right_cam0 = d_right @ R_cam1_cam0[:, None]
     jacobian[:, 1, :, :, 20:23] = (d_right_cam0 @ _skews(from_cam1)) @ d_turn[:, None]
     jacobian[:, 1, :, :, 23:26] = -d_right_cam0
-    for eye, d_point in ((0, d_left), (1, d_right_cam0)):
-        jacobian[:, eye, :, :, 26:29] = -d_point @ _skews(arm)
-        jacobian[:, eye, :, :, 29:32] = d_point
+    for side, d_point in ((0, d_left), (1, d_right_cam0)):
+        jacobian[:, side, :, :, 26:29] = -d_point @ _skews(arm)
+        jacobian[:, side, :, :, 29:32] = d_point
     residual = np.stack([observations.left - left, observations.right - right], axis=1)
     unseen = ~np.isfinite(residual[..., 0])
     residual[unseen] = 0.0
@@ -222,7 +224,7 @@ def _step(system: _System, state: RigState, prior: Prior, damping: float) -> Rig
     shared = system.shared + prior.information
     gradient = system.shared_gradient + prior.information @ (prior.mean - state.shared)
     damped = shared + damping * np.diag(np.diag(shared))
-    own = system.own + damping * np.eye(POSE) * np.einsum("vii->vi", system.own)[:, None, :]
+    own = system.own + damping * np.eye(POSE_UNKNOWNS) * np.einsum("vii->vi", system.own)[:, None, :]
     reduced, right = _reduce(system, damped, gradient, own)
     d_shared = _solve_scaled(reduced, right)
     touched = np.einsum("vgp,vg->vp", system.coupling, d_shared[system.columns])
@@ -251,8 +253,8 @@ def _moved(state: RigState, d_shared: Array, d_own: Array) -> RigState:
     turns = np.array([R_from_rotvec(turn) for turn in d_own[:, :3]])
     return replace(
         state,
-        eyes=state.eyes + d_shared[:EYES].reshape(2, 10),
-        between=state.between + d_shared[EYES:].reshape(-1, POSE),
+        cameras=state.cameras + d_shared[:CAMERA_UNKNOWNS].reshape(2, 10),
+        between=state.between + d_shared[CAMERA_UNKNOWNS:].reshape(-1, POSE_UNKNOWNS),
         R_cam0_board=turns @ state.R_cam0_board,
         t_cam0_board_m=state.t_cam0_board_m + d_own[:, 3:],
     )
@@ -263,5 +265,5 @@ def _solution(observations: Observations, system: _System, state: RigState, prio
     scale = 1.0 / np.sqrt(np.diag(reduced))
     covariance = np.linalg.inv(reduced * np.outer(scale, scale)) * np.outer(scale, scale)
     residual = residuals(observations, state)
-    measured = noise_px(residual, len(state.shared) + POSE * observations.view_count)
+    measured = noise_px(residual, len(state.shared) + POSE_UNKNOWNS * observations.view_count)
     return Solution(state, measured, covariance * max(1.0, (measured / sigma_px) ** 2), residual)

@@ -25,7 +25,7 @@ _FOLDS = 4
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Row errors of all held-out corners that both eyes saw.
+    """Row errors of all held-out corners that both cameras saw.
 
     `row_px` (n,), signed; `left_px` (n, 2) where in the left image; `baseline` (n,) which baseline; `median_px` and
     `p95_px` of the absolute row error.
@@ -62,8 +62,8 @@ class LeftOutBaseline:
 
 def geometry_at(calibration: Calibration, index: int) -> StereoGeometry:
     """Return the solved geometry at one of the calibrated baselines."""
-    eyes, size = calibration.solution.state.eyes, calibration.observations.size
-    cam0, cam1 = camera_from_vector(eyes[0], size), camera_from_vector(eyes[1], size)
+    cameras, size = calibration.solution.state.cameras, calibration.observations.size
+    cam0, cam1 = camera_from_vector(cameras[0], size), camera_from_vector(cameras[1], size)
     return StereoGeometry(cam0, cam1, calibration.poses[index])
 
 
@@ -103,10 +103,10 @@ def _left_out(calibration: Calibration, index: int, full_median_px: float) -> Le
     views = calibration.observations.baseline == index
     rest = resolve(calibration, ~views)
     nominal_m = float(calibration.nominal_m[index])
-    eyes = [camera_from_vector(eye, rest.observations.size) for eye in rest.solution.state.eyes]
+    cameras = [camera_from_vector(side, rest.observations.size) for side in rest.solution.state.cameras]
     knots_m, poses = rest.knots()
-    T = RigModel.from_poses(eyes[0], eyes[1], knots_m.tolist(), list(poses)).T_cam0_cam1(nominal_m)
-    predicted, full = StereoGeometry(eyes[0], eyes[1], T), geometry_at(calibration, index)
+    T = RigModel.from_poses(cameras[0], cameras[1], knots_m.tolist(), list(poses)).T_cam0_cam1(nominal_m)
+    predicted, full = StereoGeometry(cameras[0], cameras[1], T), geometry_at(calibration, index)
     return LeftOutBaseline(
         baseline_mm=nominal_m * 1e3,
         epipolar_median_px=float(np.median(np.abs(_row_errors(calibration, views, predicted)[0]))),
@@ -117,7 +117,7 @@ def _left_out(calibration: Calibration, index: int, full_median_px: float) -> Le
 
 
 def _row_errors(calibration: Calibration, views: NDArray[np.bool_], geometry: StereoGeometry) -> tuple[Array, Array]:
-    """Return the row error (n,) and left pixel (n, 2) of all corners that both eyes saw in the chosen views."""
+    """Return the row error (n,) and left pixel (n, 2) of all corners that both cameras saw in the chosen views."""
     left = calibration.observations.left[views].reshape(-1, 2)
     right = calibration.observations.right[views].reshape(-1, 2)
     seen = np.isfinite(left[:, 0]) & np.isfinite(right[:, 0])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.solver.bundle_adjustment import RigState
-from morpheyes_daemon.calibration.solver.projection import camera_from_vector
+from morpheyes_daemon.calibration.solver.projection import camera_from_vector, camera_vector
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.errors import InputError
@@ -28,7 +28,7 @@ def first_guess(observations: Observations) -> tuple[RigState, NDArray[np.bool_]
 
     The state covers the usable views only. Raises InputError when a camera cannot be guessed.
     """
-    cameras = [_camera(observations, eye) for eye in (0, 1)]
+    cameras = [_camera(observations, side) for side in (0, 1)]
     T_left = [board_pose(corners, observations.board, cameras[0]) for corners in observations.left]
     T_right = [board_pose(corners, observations.board, cameras[1]) for corners in observations.right]
     between = np.array([_between(observations, i, T_left, T_right) for i in range(len(observations.nominal_m))])
@@ -38,8 +38,8 @@ def first_guess(observations: Observations) -> tuple[RigState, NDArray[np.bool_]
         poses.append(left if left is not None else None if right is None else T_cam0_cam1 @ right)
     usable = np.array([T is not None for T in poses])
     boards = np.array([T for T in poses if T is not None])
-    eyes = np.array([[c.fx, c.fy, c.cx, c.cy, c.alpha, *c.k] for c in cameras])
-    return RigState(eyes, between, boards[:, :3, :3], boards[:, :3, 3]), usable
+    vectors = np.array([camera_vector(camera) for camera in cameras])
+    return RigState(vectors, between, boards[:, :3, :3], boards[:, :3, 3]), usable
 
 
 def board_pose(pixels: Array, board: Board, camera: CameraIntrinsics) -> Array | None:
@@ -60,13 +60,13 @@ def board_pose(pixels: Array, board: Board, camera: CameraIntrinsics) -> Array |
     return pose(R_from_rotvec(turn), shift)
 
 
-def _camera(observations: Observations, eye: int) -> CameraIntrinsics:
-    pixels = (observations.left, observations.right)[eye]
+def _camera(observations: Observations, side: int) -> CameraIntrinsics:
+    pixels = (observations.left, observations.right)[side]
     counts = np.isfinite(pixels[..., 0]).sum(axis=1)
     good = np.flatnonzero(counts >= min(observations.board.corner_count, 2 * _FEWEST_CORNERS))
     if len(good) < 3:
-        name = "left" if eye == 0 else "right"
-        raise InputError(f"The {name} eye sees the board in only {len(good)} pictures; take ten per baseline.")
+        name = "left" if side == 0 else "right"
+        raise InputError(f"The {name} camera sees the board in only {len(good)} pictures; take ten per baseline.")
     chosen = good[np.unique(np.linspace(0, len(good) - 1, _VIEWS_PER_CAMERA).round().astype(int))]
     camera, error = _opencv(observations, pixels, chosen)
     sound = error <= _SUSPECT * np.median(error)
@@ -98,7 +98,7 @@ def _between(
     poses = [left @ inverse(right) for left, right in seen if left is not None and right is not None]
     if not poses:
         raise InputError(
-            f"At {observations.nominal_m[baseline] * 1e3:g} mm no picture shows the board to both eyes; retake them."
+            f"At {observations.nominal_m[baseline] * 1e3:g} mm no picture shows the board to both cameras; retake them."
         )
     vectors = np.array([[*rotvec_from_R(T[:3, :3]), *T[:3, 3]] for T in poses])
     return np.asarray(np.median(vectors, axis=0))

@@ -1,4 +1,4 @@
-"""Views that do not fit the rest, named by file: a blurred board, a wrong picture, an eye that moved in between.
+"""Views that do not fit the rest, named by file: a blurred board, a wrong picture, a camera that moved in between.
 
 A view of two pictures has one board pose, so a bad picture spoils its partner's residuals as well; which of the two
 is to blame is told by fitting the board to each alone.
@@ -35,13 +35,13 @@ class Outlier:
     """A picture taken out of the solve; `rms_px` is how badly it fitted."""
 
     view: int
-    eye: int
+    side: int
     name: str
     rms_px: float
 
 
 def view_rms_px(residual_px: Array) -> Array:
-    """Return the rms per view and eye (V, 2) of the corner distance, NaN where that eye saw nothing.
+    """Return the rms per view and camera (V, 2) of the corner distance, NaN where that camera saw nothing.
 
     As OpenCV counts it: the root of the mean squared length of the two-dimensional residuals.
     """
@@ -53,15 +53,15 @@ def view_rms_px(residual_px: Array) -> Array:
 
 
 def find_outliers(observations: Observations, solution: Solution) -> list[Outlier]:
-    """Return the pictures that fit far worse than the rest, with the guilty eye named (both when neither fits)."""
+    """Return the pictures that fit far worse than the rest, with the guilty camera named (both when neither fits)."""
     rms = view_rms_px(solution.residual_px)
     usual = float(np.nanmedian(rms))
     limit = max(_SUSPECT * usual, usual + _LEAST_PX)
     outliers = []
     for view in np.flatnonzero(np.nanmax(rms, axis=1) > limit):
-        for eye in _guilty(observations, solution, int(view), rms[view], limit):
-            name = observations.names[view][eye]
-            outliers.append(Outlier(int(view), eye, name, float(rms[view, eye])))
+        for side in _pictures_to_remove(observations, solution, int(view), rms[view], limit):
+            name = observations.names[view][side]
+            outliers.append(Outlier(int(view), side, name, float(rms[view, side])))
     return outliers
 
 
@@ -81,10 +81,10 @@ def reject_outliers(observations: Observations, solution: Solution) -> tuple[Obs
 
 
 def without(observations: Observations, outliers: list[Outlier]) -> tuple[Observations, NDArray[np.bool_]]:
-    """Return the observations with those pictures blanked, and which views (V,) still show a board to some eye."""
+    """Return the observations with those pictures blanked, and which views (V,) still show a board to some camera."""
     left, right = observations.left.copy(), observations.right.copy()
     for outlier in outliers:
-        (left, right)[outlier.eye][outlier.view] = np.nan
+        (left, right)[outlier.side][outlier.view] = np.nan
     seen = np.isfinite(left[..., 0]).sum(axis=1), np.isfinite(right[..., 0]).sum(axis=1)
     kept = np.maximum(*seen) >= _FEWEST_CORNERS
     return replace(observations, left=left, right=right).subset(kept), kept
@@ -93,23 +93,25 @@ def without(observations: Observations, outliers: list[Outlier]) -> tuple[Observ
 def _squares_px(observations: Observations) -> Array:
     """Return how far apart corners are around each (V, 2, N), NaN where unseen."""
     pictures = np.stack([observations.left, observations.right], axis=1)
-    return np.array([[spacing_px(eye, observations.board) for eye in view] for view in pictures])
+    return np.array([[spacing_px(side, observations.board) for side in view] for view in pictures])
 
 
-def _guilty(observations: Observations, solution: Solution, view: int, rms: Array, limit: float) -> list[int]:
-    """Return the eyes of a suspect view to take out."""
-    both = [eye for eye in (0, 1) if np.isfinite(rms[eye])]
-    alone = [_rms_alone(observations, solution, view, eye) for eye in both]
-    bad = [eye for eye, error in zip(both, alone, strict=True) if error > limit]
+def _pictures_to_remove(
+    observations: Observations, solution: Solution, view: int, rms: Array, limit: float
+) -> list[int]:
+    """Return the cameras of a suspect view to take out."""
+    both = [side for side in (0, 1) if np.isfinite(rms[side])]
+    alone = [_rms_alone(observations, solution, view, side) for side in both]
+    bad = [side for side, error in zip(both, alone, strict=True) if error > limit]
     return bad or both
 
 
-def _rms_alone(observations: Observations, solution: Solution, view: int, eye: int) -> float:
+def _rms_alone(observations: Observations, solution: Solution, view: int, side: int) -> float:
     """Return the rms of one picture with a board pose of its own."""
-    camera = camera_from_vector(solution.state.eyes[eye], observations.size)
-    T_cam_board = board_pose((observations.left, observations.right)[eye][view], observations.board, camera)
+    camera = camera_from_vector(solution.state.cameras[side], observations.size)
+    T_cam_board = board_pose((observations.left, observations.right)[side][view], observations.board, camera)
     if T_cam_board is None:
         return np.inf
     p_cam = observations.board.points_m @ T_cam_board[:3, :3].T + T_cam_board[:3, 3]
-    residual = (observations.left, observations.right)[eye][view] - camera.project(p_cam)
+    residual = (observations.left, observations.right)[side][view] - camera.project(p_cam)
     return float(np.sqrt(np.nanmean(np.sum(residual**2, axis=-1))))

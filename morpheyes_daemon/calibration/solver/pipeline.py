@@ -16,7 +16,7 @@ import yaml
 from morpheyes_daemon.calibration.solver.acceptance import judge
 from morpheyes_daemon.calibration.solver.cross_validation import held_out, leave_one_out
 from morpheyes_daemon.calibration.solver.plausibility import ScaleCheck, misnamed, scale_check
-from morpheyes_daemon.calibration.solver.result import Solved, details, rig_model
+from morpheyes_daemon.calibration.solver.result import CalibrationResult, details, rig_model
 from morpheyes_daemon.calibration.solver.solver import Calibration, calibrate
 from morpheyes_daemon.calibration.solver.uncertainty import baseline_uncertainty
 from morpheyes_daemon.calibration.targets.boards import Board
@@ -32,7 +32,7 @@ CORNERS_SUFFIX = ".corners.npz"
 
 def solve_folder(
     root: Path, board: Board, out: Path | None, progress: Progress = silent, header: Mapping[str, Any] | None = None
-) -> Solved:
+) -> CalibrationResult:
     """Solve the pictures under `root`; writes `out` when given. Raises InputError or CalibrationError.
 
     `header` (date, name of the rig) is put first in the file's details.
@@ -48,7 +48,7 @@ def solve_folder(
 
 def solve_observations(
     observations: Observations, progress: Progress = silent, header: Mapping[str, Any] | None = None
-) -> Solved:
+) -> CalibrationResult:
     """Solve, check and judge; raises CalibrationError when the two sizes a person gave cannot both be right."""
     calibration, named = _without_misnamed(calibrate(observations, progress), progress)
     lost = observations.lost + named
@@ -59,7 +59,9 @@ def solve_observations(
     uncertainty = [baseline_uncertainty(calibration, index) for index in range(len(calibration.nominal_m))]
     verdict = judge(calibration, unseen, left_out, uncertainty, scale, lost)
     rig = rig_model(calibration)
-    solved = Solved(calibration, unseen, left_out, uncertainty, scale, verdict, observations.problems + lost, rig)
+    solved = CalibrationResult(
+        calibration, unseen, left_out, uncertainty, scale, verdict, observations.problems + lost, rig
+    )
     return replace(solved, rig=replace(rig, details={**(header or {}), **details(solved)}))
 
 

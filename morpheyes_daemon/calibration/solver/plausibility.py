@@ -70,7 +70,7 @@ def misnamed(nominal_m: Array, lengths_m: Array) -> list[int]:
 
 
 def triangulate(geometry: StereoGeometry, left: Array, right: Array) -> Array:
-    """Return the points (..., 3) in the rectified frame of raw pixels (..., 2) of both eyes."""
+    """Return the points (..., 3) in the rectified frame of raw pixels (..., 2) of both cameras."""
     rect_left, rect_right = geometry.rectified(left, right)
     depth = geometry.length_m * geometry.f_px / (rect_left[..., 0] - rect_right[..., 0])
     rows = (rect_left[..., 1] + rect_right[..., 1]) / 2

@@ -1,4 +1,4 @@
-"""What a linear actuator can do: its eyes move along a line, and whatever else they do changes smoothly.
+"""What a linear actuator can do: its cameras move along a line, and whatever else they do changes smoothly.
 
 Each of the six components of T_cam0_cam1 is a low-order polynomial of the nominal baseline plus a scatter of its own
 (play, the servo's repeatability). Order and scatter are chosen per component by how well the other baselines
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE, Prior
+from morpheyes_daemon.calibration.solver.bundle_adjustment import CAMERA_UNKNOWNS, POSE_UNKNOWNS, Prior
 from morpheyes_daemon.transforms import Array
 
 COMPONENTS = ("rotation_x", "rotation_y", "rotation_z", "x", "y", "z")
@@ -43,13 +43,13 @@ class Rail:
     def information(self) -> Array:
         """Return the quadratic (6 M, 6 M) on the stacked poses: deviation from the best polynomial over scatter."""
         count = len(self.nominal_m)
-        information = np.zeros((count, POSE, count, POSE))
+        information = np.zeros((count, POSE_UNKNOWNS, count, POSE_UNKNOWNS))
         for index, component in enumerate(self.components):
             basis = polynomial(self.nominal_m, self.nominal_m, component.order)
             orthonormal, _ = np.linalg.qr(basis)
             away = np.eye(count) - orthonormal @ orthonormal.T
             information[:, index, :, index] = away / component.scatter**2
-        return information.reshape(count * POSE, count * POSE)
+        return information.reshape(count * POSE_UNKNOWNS, count * POSE_UNKNOWNS)
 
     def at(self, poses: Array, covariance: Array, nominal_m: Array) -> Array:
         """Return the pose vectors (K, 6) at other nominal baselines (K,) from solved poses (M, 6).
@@ -59,8 +59,8 @@ class Rail:
         (6 M, 6 M) is that of the poses.
         """
         count = len(self.nominal_m)
-        blocks = covariance.reshape(count, POSE, count, POSE)
-        predicted = np.empty((len(nominal_m), POSE))
+        blocks = covariance.reshape(count, POSE_UNKNOWNS, count, POSE_UNKNOWNS)
+        predicted = np.empty((len(nominal_m), POSE_UNKNOWNS))
         for index, component in enumerate(self.components):
             basis = polynomial(self.nominal_m, self.nominal_m, component.order)
             spread = blocks[:, index, :, index] + np.eye(count) * component.scatter**2
@@ -80,7 +80,7 @@ def fit_rail(nominal_m: Array, poses: Array, covariance: Array) -> Rail | None:
     count = len(nominal_m)
     if count < FEWEST_BASELINES:
         return None
-    blocks = covariance.reshape(count, POSE, count, POSE)
+    blocks = covariance.reshape(count, POSE_UNKNOWNS, count, POSE_UNKNOWNS)
     components = tuple(
         _fit(name, nominal_m, poses[:, index], blocks[:, index, :, index], _SCATTER_RAD if index < 3 else _SCATTER_M)
         for index, name in enumerate(COMPONENTS)
@@ -91,7 +91,7 @@ def fit_rail(nominal_m: Array, poses: Array, covariance: Array) -> Rail | None:
 def with_rail(prior: Prior, rail: Rail) -> Prior:
     """Return the prior of the cameras with the rail's quadratic on the poses added."""
     information = prior.information.copy()
-    information[EYES:, EYES:] += rail.information()
+    information[CAMERA_UNKNOWNS:, CAMERA_UNKNOWNS:] += rail.information()
     return Prior(prior.mean, information)
 
 

@@ -1,4 +1,4 @@
-"""What is left after rectification: row error between the eyes, and the disparity that points at infinity show.
+"""What is left after rectification: row error between the cameras, and the disparity that points at infinity show.
 
 The row (epipolar) error is what a matcher suffers; the disparity at infinity is the bias that a yaw error or a wrong
 principal point adds to every disparity, which no row error shows. Both are measured in rectified pixels.
@@ -28,16 +28,16 @@ class StereoGeometry:
 
     @property
     def f_px(self) -> float:
-        """The common focal length of the rectified eyes, as stereo.rectify takes it."""
+        """The common focal length of the rectified cameras, as stereo.rectify takes it."""
         return (self.cam0.fx + self.cam0.fy + self.cam1.fx + self.cam1.fy) / 4
 
     @property
     def length_m(self) -> float:
-        """Distance between the eyes."""
+        """Distance between the cameras."""
         return float(np.linalg.norm(self.T_cam0_cam1[:3, 3]))
 
     def rectified(self, left: Array, right: Array) -> tuple[Array, Array]:
-        """Return raw pixels (..., 2) of both eyes as rectified ones about the principal point; NaN stays NaN."""
+        """Return raw pixels (..., 2) of both cameras as rectified ones about the principal point; NaN stays NaN."""
         R_rect_cam0 = rectifying_rotation(self.T_cam0_cam1[:3, 3])
         R_rect_cam1 = R_rect_cam0 @ self.T_cam0_cam1[:3, :3]
         return self._turned(self.cam0, R_rect_cam0, left), self._turned(self.cam1, R_rect_cam1, right)

@@ -1,4 +1,4 @@
-"""Where the eyes really come to rest: target against achieved baseline, mean and spread over many visits.
+"""Where the cameras really come to rest: target against achieved baseline, mean and spread over many visits.
 
 The paper shows this as its rig's accuracy (section II, the figure of target against achieved baseline: ten samples
 for each position, mean and 10 sigma band, largest error 1.83 mm). Each visit is one picture pair of a board; with
@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from morpheyes_daemon.calibration.solver import bundle_adjustment as bundle
-from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE, Prior, RigState
+from morpheyes_daemon.calibration.solver.bundle_adjustment import CAMERA_UNKNOWNS, POSE_UNKNOWNS, Prior, RigState
 from morpheyes_daemon.calibration.solver.initial_guess import board_pose
 from morpheyes_daemon.calibration.solver.projection import camera_vector
 from morpheyes_daemon.calibration.targets.observations import Observations
@@ -63,13 +63,13 @@ def positions(rig: RigModel, observations: Observations, progress: Progress = si
         raise InputError("The folder names no baselines; put the visits to each target in a folder such as 150mm.")
     found = []
     for index, target in enumerate(observations.nominal_m):
-        progress("measuring where the eyes came to rest", index, len(observations.nominal_m))
+        progress("measuring where the cameras came to rest", index, len(observations.nominal_m))
         views = np.flatnonzero(observations.baseline == index)
         lengths = [_length_m(rig, observations, int(view), float(target)) for view in views]
         achieved = np.array([length for length in lengths if length is not None])
         if len(achieved):
             found.append(Position(float(target), achieved))
-    progress("measuring where the eyes came to rest", len(observations.nominal_m), len(observations.nominal_m))
+    progress("measuring where the cameras came to rest", len(observations.nominal_m), len(observations.nominal_m))
     return found
 
 
@@ -119,7 +119,7 @@ def draw(found: list[Position]) -> Figure:
 
 
 def _length_m(rig: RigModel, observations: Observations, view: int, target_m: float) -> float | None:
-    """Return the baseline of one visit, None when an eye does not see the board."""
+    """Return the baseline of one visit, None when a camera does not see the board."""
     T_cam0_board = board_pose(observations.left[view], observations.board, rig.cam0)
     if T_cam0_board is None or not np.isfinite(observations.right[view, :, 0]).any():
         return None
@@ -128,8 +128,8 @@ def _length_m(rig: RigModel, observations: Observations, view: int, target_m: fl
     one = replace(observations.subset(chosen), nominal_m=np.array([target_m]), baseline=np.zeros(1, dtype=np.intp))
     T_cam0_cam1 = rig.T_cam0_cam1(target_m)
     between = np.concatenate([rotvec_from_R(T_cam0_cam1[:3, :3]), T_cam0_cam1[:3, 3]])
-    eyes = np.stack([camera_vector(rig.cam0), camera_vector(rig.cam1)])
-    state = RigState(eyes, between[None], T_cam0_board[None, :3, :3], T_cam0_board[None, :3, 3])
+    cameras = np.stack([camera_vector(rig.cam0), camera_vector(rig.cam1)])
+    state = RigState(cameras, between[None], T_cam0_board[None, :3, :3], T_cam0_board[None, :3, 3])
     solved = bundle.solve(one, state, _known_but_for_length(state, T_cam0_cam1[:3, 3]), _CORNER_SIGMA_PX)
     return float(np.linalg.norm(solved.state.between[0, 3:]))
 
@@ -137,10 +137,14 @@ def _length_m(rig: RigModel, observations: Observations, view: int, target_m: fl
 def _known_but_for_length(state: RigState, t_cam0_cam1: Array) -> Prior:
     """Return the prior that holds cameras and directions and leaves the length along the rail open."""
     along = t_cam0_cam1 / np.linalg.norm(t_cam0_cam1)
-    information = np.zeros((EYES + POSE, EYES + POSE))
-    scale = np.maximum(np.abs(state.shared[:EYES]), 1e-3) * 1e-7
-    information[:EYES, :EYES] = np.diag(1.0 / scale**2)
-    information[EYES : EYES + 3, EYES : EYES + 3] = np.eye(3) / _TURN_SIGMA_RAD**2
+    information = np.zeros((CAMERA_UNKNOWNS + POSE_UNKNOWNS, CAMERA_UNKNOWNS + POSE_UNKNOWNS))
+    scale = np.maximum(np.abs(state.shared[:CAMERA_UNKNOWNS]), 1e-3) * 1e-7
+    information[:CAMERA_UNKNOWNS, :CAMERA_UNKNOWNS] = np.diag(1.0 / scale**2)
+    information[CAMERA_UNKNOWNS : CAMERA_UNKNOWNS + 3, CAMERA_UNKNOWNS : CAMERA_UNKNOWNS + 3] = (
+        np.eye(3) / _TURN_SIGMA_RAD**2
+    )
     line = np.outer(along, along)
-    information[EYES + 3 :, EYES + 3 :] = line / _LENGTH_SIGMA_M**2 + (np.eye(3) - line) / _SHIFT_SIGMA_M**2
+    information[CAMERA_UNKNOWNS + 3 :, CAMERA_UNKNOWNS + 3 :] = (
+        line / _LENGTH_SIGMA_M**2 + (np.eye(3) - line) / _SHIFT_SIGMA_M**2
+    )
     return Prior(state.shared, information)

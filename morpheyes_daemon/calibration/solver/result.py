@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.calibration.solver.acceptance import Verdict
+from morpheyes_daemon.calibration.solver.acceptance import Acceptance
 from morpheyes_daemon.calibration.solver.cross_validation import HeldOut, LeftOutBaseline
 from morpheyes_daemon.calibration.solver.plausibility import ScaleCheck
 from morpheyes_daemon.calibration.solver.projection import camera_from_vector
@@ -20,7 +20,7 @@ from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class CalibrationResult:
     """A calibration, how it did on boards it had not seen, what to think of it, and the rig model with all of it."""
 
     calibration: Calibration
@@ -28,7 +28,7 @@ class Solved:
     left_out: list[LeftOutBaseline]
     uncertainty: list[BaselineUncertainty]
     scale: ScaleCheck
-    verdict: Verdict
+    verdict: Acceptance
     problems: tuple[str, ...]
     rig: RigModel
 
@@ -60,7 +60,7 @@ class Solved:
 def rig_model(calibration: Calibration, details: Mapping[str, Any] | None = None) -> RigModel:
     """Return the rig model of a calibration; baselines without rms lie between calibrated ones, on the rail."""
     state, size = calibration.solution.state, calibration.observations.size
-    cam0, cam1 = (camera_from_vector(eye, size) for eye in state.eyes)
+    cam0, cam1 = (camera_from_vector(side, size) for side in state.cameras)
     rms = calibration.rms_px
     sigma = [baseline_uncertainty(calibration, index) for index in range(len(calibration.nominal_m))]
     lengths, yaws = [one.length_m for one in sigma], [one.yaw_rad for one in sigma]
@@ -76,7 +76,7 @@ def rig_model(calibration: Calibration, details: Mapping[str, Any] | None = None
     return RigModel(cam0, cam1, tuple(baselines), "solved", details or {})
 
 
-def details(solved: Solved) -> dict[str, Any]:
+def details(solved: CalibrationResult) -> dict[str, Any]:
     """Return what the calibration file keeps for people and reports."""
     calibration, board = solved.calibration, solved.calibration.observations.board
     seen = coverage(calibration.observations)
@@ -87,7 +87,7 @@ def details(solved: Solved) -> dict[str, Any]:
         "retake": list(solved.verdict.retake),
         "views": np.bincount(calibration.observations.baseline, minlength=len(calibration.nominal_m)).tolist(),
         "corner_noise_px": calibration.solution.sigma_px,
-        "stray_corners": calibration.strays,
+        "stray_corners": calibration.stray_corners,
         "outliers": [{"file": o.name, "rms_px": round(o.rms_px, 3)} for o in calibration.outliers],
         "problems": list(solved.problems),
         "sigma": {
@@ -118,12 +118,12 @@ def _rail_rows(calibration: Calibration) -> list[dict[str, Any]]:
     return [{"component": c.name, "order": c.order, "scatter": c.scatter} for c in calibration.rail.components]
 
 
-def _by_baseline(solved: Solved) -> list[float | None]:
+def _by_baseline(solved: CalibrationResult) -> list[float | None]:
     rows, baseline = np.abs(solved.held_out.row_px), solved.held_out.baseline
     return [_median(rows[baseline == index]) for index in range(len(solved.calibration.nominal_m))]
 
 
-def _by_cell(solved: Solved) -> list[list[float | None]]:
+def _by_cell(solved: CalibrationResult) -> list[list[float | None]]:
     rows = np.abs(solved.held_out.row_px)
     column, row = cell_of(solved.held_out.left_px, solved.calibration.observations.size)
     cells = range(CELLS[1]), range(CELLS[0])

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.calibration.solver import bundle_adjustment as bundle
-from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE, Prior, RigState, Solution
+from morpheyes_daemon.calibration.solver.bundle_adjustment import (
+    CAMERA_UNKNOWNS,
+    POSE_UNKNOWNS,
+    Prior,
+    RigState,
+    Solution,
+)
 from morpheyes_daemon.calibration.solver.initial_guess import first_guess
 from morpheyes_daemon.calibration.solver.outliers import Outlier, find_outliers, reject_outliers, without
 from morpheyes_daemon.calibration.solver.rail_model import Rail, fit_rail, with_rail
@@ -40,7 +46,7 @@ class Calibration:
     solution: Solution
     rail: Rail | None
     outliers: tuple[Outlier, ...] = ()
-    strays: int = 0
+    stray_corners: int = 0
 
     @property
     def poses(self) -> Array:
@@ -60,12 +66,12 @@ class Calibration:
             for a, b in itertools.pairwise(self.nominal_m)
         ]
         nominal = np.concatenate([*steps, self.nominal_m[-1:]])
-        vectors = self.rail.at(between, self.solution.covariance[EYES:, EYES:], nominal)
+        vectors = self.rail.at(between, self.solution.covariance[CAMERA_UNKNOWNS:, CAMERA_UNKNOWNS:], nominal)
         return nominal, np.array([pose(R_from_rotvec(v[:3]), v[3:]) for v in vectors])
 
     @property
     def lengths_m(self) -> Array:
-        """Solved distance between the eyes (M,)."""
+        """Solved distance between the cameras (M,)."""
         return np.asarray(np.linalg.norm(self.solution.state.between[:, 3:], axis=1))
 
     @property
@@ -76,7 +82,7 @@ class Calibration:
 
     @property
     def rms_px(self) -> Array:
-        """Rms of the corner distance per baseline (M,), both eyes, outliers aside."""
+        """Rms of the corner distance per baseline (M,), both cameras, outliers aside."""
         squared = np.sum(self.solution.residual_px**2, axis=-1)
         numbers = range(len(self.observations.nominal_m))
         return np.array([np.sqrt(np.nanmean(squared[self.observations.baseline == i])) for i in numbers])
@@ -89,13 +95,13 @@ def calibrate(observations: Observations, progress: Progress = silent) -> Calibr
     kept = observations.subset(usable)
     prior = camera_prior(kept, start)
     progress("joint solve", 1, 3)
-    kept, solution, outliers, strays = _robust(kept, start, prior)
+    kept, solution, outliers, stray_corners = _robust(kept, start, prior)
     progress("learning the rail", 2, 3)
     rail = _rail(kept, solution)
     if rail is not None:
         solution = bundle.solve(kept, solution.state, with_rail(prior, rail), solution.sigma_px)
     progress("learning the rail", 3, 3)
-    return Calibration(kept, solution, rail, tuple(outliers), strays)
+    return Calibration(kept, solution, rail, tuple(outliers), stray_corners)
 
 
 def resolve(calibration: Calibration, keep: NDArray[np.bool_]) -> Calibration:
@@ -106,7 +112,7 @@ def resolve(calibration: Calibration, keep: NDArray[np.bool_]) -> Calibration:
     chosen = sorted(set(calibration.observations.baseline[keep].tolist()))
     before = calibration.solution.state
     observations = calibration.observations.subset(keep).at_baselines(chosen)
-    state = RigState(before.eyes, before.between[chosen], before.R_cam0_board[keep], before.t_cam0_board_m[keep])
+    state = RigState(before.cameras, before.between[chosen], before.R_cam0_board[keep], before.t_cam0_board_m[keep])
     prior = camera_prior(observations, state)
     solution = bundle.solve(observations, state, prior, calibration.solution.sigma_px)
     rail = _rail(observations, solution)
@@ -121,15 +127,15 @@ def solve_separately(observations: Observations) -> list[Calibration]:
 
 
 def camera_prior(observations: Observations, state: RigState) -> Prior:
-    """Return the weak prior of both cameras; the poses between the eyes are free."""
+    """Return the weak prior of both cameras; the poses between the cameras are free."""
     width, height = observations.size
-    count = EYES + POSE * len(state.between)
+    count = CAMERA_UNKNOWNS + POSE_UNKNOWNS * len(state.between)
     mean, sigma = np.zeros(count), np.full(count, np.inf)
-    focal = float(np.mean(state.eyes[:, :2]))
-    for eye in (0, 1):
-        mean[10 * eye : 10 * eye + 4] = focal, focal, (width - 1) / 2, (height - 1) / 2
+    focal = float(np.mean(state.cameras[:, :2]))
+    for side in (0, 1):
+        mean[10 * side : 10 * side + 4] = focal, focal, (width - 1) / 2, (height - 1) / 2
         spread = [_FOCAL_SHARE * focal] * 2 + [_CENTRE_SHARE * width] * 2
-        sigma[10 * eye : 10 * eye + 10] = spread + list(_CAMERA_SIGMA.values())
+        sigma[10 * side : 10 * side + 10] = spread + list(_CAMERA_SIGMA.values())
     return Prior(mean, np.diag(1.0 / sigma**2))
 
 
@@ -140,7 +146,7 @@ def _robust(
     rough = bundle.solve(observations, start, prior, _FIRST_SIGMA_PX)
     solution = bundle.solve(observations, rough.state, prior, rough.sigma_px)
     named: list[Outlier] = []
-    strays = 0
+    stray_corners = 0
     for _ in range(_OUTLIER_ROUNDS):
         observations, more = reject_outliers(observations, solution)
         if more:
@@ -148,13 +154,15 @@ def _robust(
         found = find_outliers(observations, solution)
         if not found and not more:
             break
-        strays, named = strays + more, named + found
+        stray_corners, named = stray_corners + more, named + found
         observations, kept = without(observations, found)
         state = solution.state
         state = replace(state, R_cam0_board=state.R_cam0_board[kept], t_cam0_board_m=state.t_cam0_board_m[kept])
         solution = bundle.solve(observations, state, prior, solution.sigma_px)
-    return observations, solution, named, strays
+    return observations, solution, named, stray_corners
 
 
 def _rail(observations: Observations, solution: Solution) -> Rail | None:
-    return fit_rail(observations.nominal_m, solution.state.between, solution.covariance[EYES:, EYES:])
+    return fit_rail(
+        observations.nominal_m, solution.state.between, solution.covariance[CAMERA_UNKNOWNS:, CAMERA_UNKNOWNS:]
+    )

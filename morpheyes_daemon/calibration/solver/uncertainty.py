@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE
+from morpheyes_daemon.calibration.solver.bundle_adjustment import CAMERA_UNKNOWNS, POSE_UNKNOWNS
 from morpheyes_daemon.calibration.solver.projection import CAMERA_PARAMETERS, camera_from_vector
 from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px
 from morpheyes_daemon.calibration.solver.solver import Calibration
@@ -34,26 +34,28 @@ class BaselineUncertainty:
 def baseline_uncertainty(calibration: Calibration, index: int) -> BaselineUncertainty:
     """Return the uncertainty of the baseline's length and of the disparity at infinity there."""
     solution = calibration.solution
-    columns = np.concatenate([np.arange(EYES), EYES + POSE * index + np.arange(POSE)])
+    columns = np.concatenate(
+        [np.arange(CAMERA_UNKNOWNS), CAMERA_UNKNOWNS + POSE_UNKNOWNS * index + np.arange(POSE_UNKNOWNS)]
+    )
     covariance = solution.covariance[np.ix_(columns, columns)]
     values = solution.state.shared[columns]
     true = _geometry(values, calibration.observations.size)
     bias = _derivative(values, covariance, lambda v: _bias_px(v, true, calibration.observations.size))
-    direction = values[EYES + 3 :] / np.linalg.norm(values[EYES + 3 :])
-    length = float(np.sqrt(direction @ covariance[EYES + 3 :, EYES + 3 :] @ direction))
+    direction = values[CAMERA_UNKNOWNS + 3 :] / np.linalg.norm(values[CAMERA_UNKNOWNS + 3 :])
+    length = float(np.sqrt(direction @ covariance[CAMERA_UNKNOWNS + 3 :, CAMERA_UNKNOWNS + 3 :] @ direction))
     sigma_px = float(np.sqrt(bias @ covariance @ bias))
     return BaselineUncertainty(length, sigma_px, sigma_px / true.f_px)
 
 
 def camera_uncertainty(calibration: Calibration) -> tuple[dict[str, float], dict[str, float]]:
-    """Return one standard deviation per camera parameter, left and right eye."""
-    sigma = np.sqrt(np.diag(calibration.solution.covariance)[:EYES]).reshape(2, -1)
-    left, right = (dict(zip(CAMERA_PARAMETERS, map(float, eye), strict=True)) for eye in sigma)
+    """Return one standard deviation per camera parameter, left and right camera."""
+    sigma = np.sqrt(np.diag(calibration.solution.covariance)[:CAMERA_UNKNOWNS]).reshape(2, -1)
+    left, right = (dict(zip(CAMERA_PARAMETERS, map(float, side), strict=True)) for side in sigma)
     return left, right
 
 
 def _geometry(values: Array, size: tuple[int, int]) -> StereoGeometry:
-    T_cam0_cam1 = pose(R_from_rotvec(values[EYES : EYES + 3]), values[EYES + 3 :])
+    T_cam0_cam1 = pose(R_from_rotvec(values[CAMERA_UNKNOWNS : CAMERA_UNKNOWNS + 3]), values[CAMERA_UNKNOWNS + 3 :])
     return StereoGeometry(camera_from_vector(values[:10], size), camera_from_vector(values[10:20], size), T_cam0_cam1)
 
 

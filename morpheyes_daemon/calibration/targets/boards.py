@@ -1,7 +1,7 @@
 """Calibration boards: what they look like, where their corners are, and finding those corners in an image.
 
 Chessboards and ChArUco boards. Corners come back in the board's own order, which for a chessboard seen alone is
-known only up to a turn of the board; `aligned` settles it between the two eyes, and that is all a stereo solve
+known only up to a turn of the board; `aligned` settles it between the two cameras, and that is all a stereo solve
 needs. How the squares are measured is the person's business: no picture can tell the size of a square.
 """
 
@@ -131,9 +131,9 @@ def find_corners(image: Image, board: Board) -> Array | None:
 
 
 def aligned(left: Array, right: Array, board: Board) -> Array:
-    """Return the right eye's chessboard corners in the left eye's order.
+    """Return the right camera's chessboard corners in the left camera's order.
 
-    The eyes look the same way up, so of the board's possible turns the one whose corner grid points the same way
+    The cameras look the same way up, so of the board's possible turns the one whose corner grid points the same way
     in both images is meant. ChArUco corners carry their numbers and need none of this.
     """
     if board.kind == "charuco":

@@ -1,6 +1,6 @@
 """Leading a person with a board: which pictures are worth keeping, and where to hold the board next.
 
-A pair is kept when both eyes see the board, it is held still, and it shows something that the kept ones do not: other
+A pair is kept when both cameras see the board, it is held still, and it shows something that the kept ones do not: other
 parts of the image, another distance, another tilt. Taking the pictures is somebody else's job.
 """
 
@@ -20,7 +20,7 @@ BASELINE_VIEWS = 12
 """Pairs that make a baseline complete."""
 
 _STILL_PX = 0.7
-"""Corners that move by more between two frames blur, and the eyes expose at different times."""
+"""Corners that move by more between two frames blur, and the cameras expose at different times."""
 _NEW_CELLS = 3
 _NEW_DISTANCE = 1.2
 _NEW_TILT = 0.12
@@ -65,9 +65,9 @@ class CaptureGuide:
         """Enough pairs are kept."""
         return self.kept >= self.wanted
 
-    def covered(self, eye: int) -> NDArray[np.int64]:
+    def covered(self, side: int) -> NDArray[np.int64]:
         """Return corners kept per cell (rows, columns) of the left (0) or right (1) image."""
-        pixels = [(one.left, one.right)[eye] for one in self._kept]
+        pixels = [(one.left, one.right)[side] for one in self._kept]
         return count_cells(np.array(pixels), self.size) if pixels else np.zeros(CELLS[::-1], dtype=np.int64)
 
     def consider(self, left: Image, right: Image) -> Hint:
@@ -75,21 +75,21 @@ class CaptureGuide:
         seen_left, seen_right = find_corners(left, self.board), find_corners(right, self.board)
         if seen_left is None or seen_right is None:
             self._last = None
-            return Hint(False, self._blind(seen_left is not None, seen_right is not None))
+            return Hint(False, self._no_board_text(seen_left is not None, seen_right is not None))
         still = self._last is not None and float(np.nanmax(np.abs(seen_left - self._last))) < _STILL_PX
         self._last = seen_left
         if not still:
             return Hint(False, "hold it still")
         seen = _describe(seen_left, aligned(seen_left, seen_right, self.board), self.board)
-        if not self._tells_more(seen):
+        if not self._adds_information(seen):
             return Hint(False, self.advice())
         self._kept.append(seen)
         return Hint(True, "kept" if not self.complete else "kept; this baseline is complete")
 
     def advice(self) -> str:
         """Return where to hold the board next."""
-        for eye, name in ((0, "left"), (1, "right")):
-            empty = empty_corners(self.covered(eye))
+        for side, name in ((0, "left"), (1, "right")):
+            empty = empty_corners(self.covered(side))
             if self.kept >= 2 and empty:
                 return f"move it to the {empty[0]} of the {name} picture"
         squares = [one.square_px for one in self._kept]
@@ -100,19 +100,19 @@ class CaptureGuide:
             return "take it farther away"
         return "tilt it another way or move it to a new place"
 
-    def _blind(self, left: bool, right: bool) -> str:
+    def _no_board_text(self, left: bool, right: bool) -> str:
         if left or right:
-            return f"only the {'left' if left else 'right'} eye sees the whole board"
+            return f"only the {'left' if left else 'right'} camera sees the whole board"
         return "no board in sight"
 
-    def _tells_more(self, seen: _Seen) -> bool:
+    def _adds_information(self, seen: _Seen) -> bool:
         if not self._kept:
             return True
-        if _fresh_cells(seen.left, self.covered(0), self.size) >= _NEW_CELLS:
+        if _new_cells(seen.left, self.covered(0), self.size) >= _NEW_CELLS:
             return True
-        if _fresh_cells(seen.right, self.covered(1), self.size) >= _NEW_CELLS:
+        if _new_cells(seen.right, self.covered(1), self.size) >= _NEW_CELLS:
             return True
-        return not any(_alike(seen, other) for other in self._kept)
+        return not any(_similar(seen, other) for other in self._kept)
 
 
 def _describe(left: Array, right: Array, board: Board) -> _Seen:
@@ -128,12 +128,12 @@ def _describe(left: Array, right: Array, board: Board) -> _Seen:
     return _Seen(left, right, float(np.nanmean(spacing_px(left, board))), np.array(tilt))
 
 
-def _alike(one: _Seen, other: _Seen) -> bool:
+def _similar(one: _Seen, other: _Seen) -> bool:
     near = 1 / _NEW_DISTANCE < one.square_px / other.square_px < _NEW_DISTANCE
     moved = float(np.linalg.norm(np.nanmean(one.left - other.left, axis=0)))
     return bool(near and moved < 3 * one.square_px and np.all(np.abs(one.tilt - other.tilt) < _NEW_TILT))
 
 
-def _fresh_cells(pixels: Array, counts: NDArray[np.int64], size: tuple[int, int]) -> int:
+def _new_cells(pixels: Array, counts: NDArray[np.int64], size: tuple[int, int]) -> int:
     column, row = cell_of(pixels[np.isfinite(pixels[:, 0])], size)
     return len({(int(r), int(c)) for r, c in zip(row, column, strict=True) if counts[r, c] == 0})

@@ -16,19 +16,19 @@ CELLS = (8, 6)
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Corners counted per image cell (rows, columns) of each eye, and the share of cells with any."""
+    """Corners counted per image cell (rows, columns) of each camera, and the share of cells with any."""
 
     left: NDArray[np.int64]
     right: NDArray[np.int64]
 
     @property
     def share(self) -> float:
-        """Share of cells that hold corners, in the eye that has fewer."""
+        """Share of cells that hold corners, in the camera that has fewer."""
         return float(min(np.mean(self.left > 0), np.mean(self.right > 0)))
 
 
 def coverage(observations: Observations) -> Coverage:
-    """Return where both eyes saw corners over all views."""
+    """Return where both cameras saw corners over all views."""
     size = observations.size
     return Coverage(count_cells(observations.left, size), count_cells(observations.right, size))
 

@@ -46,7 +46,7 @@ def observe(
     seen = list(_detect(jobs, board, cache or CornerCache(None), progress))
     size = _common_size(seen, notes)
     views = [view for view in seen if view.size == size and view.found]
-    _note_blind(seen, board, notes)
+    _note_missing_boards(seen, board, notes)
     return _assembled(folders, board, size, views, notes)
 
 
@@ -105,18 +105,18 @@ def _detect(jobs: list[tuple[int, PairFiles]], board: Board, cache: CornerCache,
 def _see(baseline: int, pair: PairFiles, board: Board, cache: CornerCache) -> _View:
     found: dict[str, Array | None] = {"left": None, "right": None}
     sizes = []
-    for eye, path in (("left", pair.left), ("right", pair.right)):
+    for side, path in (("left", pair.left), ("right", pair.right)):
         if path is None:
             continue
-        half = eye if pair.side_by_side else ""
+        half = side if pair.side_by_side else ""
         corners, size, problem = _corners_in(path, half, board, cache)
         if problem:
             return _View(baseline, pair, None, None, None, problem)
-        found[eye] = corners
+        found[side] = corners
         sizes.append((size, path))
     if len({size for size, _ in sizes}) > 1:
         (a, _), (b, path) = sizes
-        text = f"{path}: is {b[0]}x{b[1]} px but its left eye {a[0]}x{a[1]}; take the pair again at one size."
+        text = f"{path}: is {b[0]}x{b[1]} px but its left camera {a[0]}x{a[1]}; take the pair again at one size."
         return _View(baseline, pair, None, None, None, text)
     left, right = found["left"], found["right"]
     if left is not None and right is not None:
@@ -127,7 +127,7 @@ def _see(baseline: int, pair: PairFiles, board: Board, cache: CornerCache) -> _V
 def _corners_in(
     path: Path, half: str, board: Board, cache: CornerCache
 ) -> tuple[Array | None, tuple[int, int], str | None]:
-    """Return the corners, the size of one eye's picture, and a sentence when it cannot be read."""
+    """Return the corners, the size of one camera's picture, and a sentence when it cannot be read."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -140,9 +140,9 @@ def _corners_in(
     image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if content else None
     if image is None:
         return None, (0, 0), f"{path}: is not a readable picture; copy it again or remove it."
-    eye = _half(np.asarray(image, dtype=np.uint8), half)
-    size = (eye.shape[1], eye.shape[0])
-    corners = find_corners(eye, board)
+    side = _half(np.asarray(image, dtype=np.uint8), half)
+    size = (side.shape[1], side.shape[0])
+    corners = find_corners(side, board)
     cache.found[key] = np.vstack([np.empty((0, 2)) if corners is None else corners, [size]])
     return corners, size, None
 
@@ -171,7 +171,7 @@ def _common_size(seen: list[_View], problems: list[str]) -> tuple[int, int]:
     return size
 
 
-def _note_blind(seen: list[_View], board: Board, problems: list[str]) -> None:
+def _note_missing_boards(seen: list[_View], board: Board, problems: list[str]) -> None:
     for view in seen:
         if view.size is not None and not view.found:
             path = view.pair.left or view.pair.right

@@ -18,19 +18,19 @@ from morpheyes_daemon.messages.core import Image
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 _SIDE_BY_SIDE_ASPECT = 1.9
-"""Width over height from which a picture must hold both eyes."""
+"""Width over height from which a picture must hold both cameras."""
 
 
 @dataclass(frozen=True)
 class PairFiles:
-    """The files of one stereo picture; one path twice means side by side, None that this eye is missing."""
+    """The files of one stereo picture; one path twice means side by side, None that this camera is missing."""
 
     left: Path | None
     right: Path | None
 
     @property
     def side_by_side(self) -> bool:
-        """Both eyes are in one file."""
+        """Both cameras are in one file."""
         return self.left is not None and self.left == self.right
 
 
@@ -107,23 +107,23 @@ def _baseline_folder(folder: Path, nominal_m: float | None, problems: list[str])
     if not pairs:
         problems.append(f"{folder}: holds no stereo pictures; take them at this baseline, or remove the folder.")
     elif all(pair.right is None for pair in pairs) or all(pair.left is None for pair in pairs):
-        eye = "right" if pairs[0].right is None else "left"
-        raise InputError(f"{folder}: has no {eye} picture at all; copy the {eye}*.png files there.")
+        side = "right" if pairs[0].right is None else "left"
+        raise InputError(f"{folder}: has no {side} picture at all; copy the {side}*.png files there.")
     return BaselineFolder(nominal_m, folder, tuple(pairs))
 
 
 def _left_right(files: list[Path], problems: list[str]) -> list[PairFiles]:
-    eyes: dict[str, dict[int, Path]] = {"left": {}, "right": {}}
+    cameras: dict[str, dict[int, Path]] = {"left": {}, "right": {}}
     for path in files:
-        eye = "left" if path.name.lower().startswith("left") else "right"
+        side = "left" if path.name.lower().startswith("left") else "right"
         number = int(digits[-1]) if (digits := re.findall(r"\d+", path.stem)) else -1
-        if number in eyes[eye]:
-            problems.append(f"{path}: has the same number as {eyes[eye][number].name} and is left out; renumber it.")
+        if number in cameras[side]:
+            problems.append(f"{path}: has the same number as {cameras[side][number].name} and is left out; renumber it.")
             continue
-        eyes[eye][number] = path
+        cameras[side][number] = path
     pairs = []
-    for number in sorted(eyes["left"].keys() | eyes["right"].keys()):
-        left, right = eyes["left"].get(number), eyes["right"].get(number)
+    for number in sorted(cameras["left"].keys() | cameras["right"].keys()):
+        left, right = cameras["left"].get(number), cameras["right"].get(number)
         if left is None or right is None:
             alone, other = (left, "right") if right is None else (right, "left")
             problems.append(f"{alone}: has no {other} picture of the same number; copy it there or retake the pair.")

@@ -13,9 +13,9 @@ from morpheyes_daemon.transforms import Array
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Corners of one board seen by both eyes in V views at M baselines.
+    """Corners of one board seen by both cameras in V views at M baselines.
 
-    `left`, `right` (V, N, 2) are pixels, NaN where that eye did not see the corner; `baseline` (V,) counts into
+    `left`, `right` (V, N, 2) are pixels, NaN where that camera did not see the corner; `baseline` (V,) counts into
     `nominal_m` (M,), which grows (NaN for a fixed rig of unknown length); `names` are the file names of each view.
     `problems` are sentences on pictures left out, `lost` those on whole baselines.
     """

@@ -23,8 +23,8 @@ from morpheyes_daemon.stereo.calibration_file import read_calibration
 if TYPE_CHECKING:
     from morpheyes_daemon.config.vehicle import VehicleConfig
     from morpheyes_daemon.messages.core import Image
-    from morpheyes_daemon.perception.calibration_check import CheckResult, RigCheck
-    from morpheyes_daemon.rig_capture.board_capture import Scene
+    from morpheyes_daemon.perception.calibration_check import CalibrationCheck, CalibrationCheckResult
+    from morpheyes_daemon.rig_capture.board_capture import CaptureStatus
 
 
 def capture(
@@ -152,11 +152,11 @@ def repeatability(
     typer.echo(f"largest error {worst}; paper: 1.83 mm; drawn: {out}")
 
 
-def _check_recorded(rig: Any, folder: Path, baseline_mm: float | None, progress: Any) -> CheckResult:
+def _check_recorded(rig: Any, folder: Path, baseline_mm: float | None, progress: Any) -> CalibrationCheckResult:
     from morpheyes_daemon.errors import UsageError
-    from morpheyes_daemon.perception.calibration_check import RigCheck
+    from morpheyes_daemon.perception.calibration_check import CalibrationCheck
 
-    check: RigCheck | None = None
+    check: CalibrationCheck | None = None
     pairs = list(_recorded_pairs(folder))
     for done, (nominal_m, left, right) in enumerate(pairs, start=1):
         at_m = nominal_m if baseline_mm is None else baseline_mm / 1e3
@@ -164,7 +164,7 @@ def _check_recorded(rig: Any, folder: Path, baseline_mm: float | None, progress:
             at_m = rig.range_m[0]
             if rig.range_m[0] != rig.range_m[1]:
                 raise UsageError(f"{folder}: names no baseline; give --baseline-mm, or put the pairs in 150mm.")
-        check = check or RigCheck(rig, (left.shape[1], left.shape[0]))
+        check = check or CalibrationCheck(rig, (left.shape[1], left.shape[0]))
         check.add(at_m, left, right)
         progress("comparing rows", done, len(pairs))
     if check is None:
@@ -183,16 +183,16 @@ def _recorded_pairs(folder: Path) -> Iterator[tuple[float | None, Image, Image]]
                 yield one.nominal_m, left, right
 
 
-def _check_live(rig: Any, config: VehicleConfig, frames: int, progress: Any) -> CheckResult:
+def _check_live(rig: Any, config: VehicleConfig, frames: int, progress: Any) -> CalibrationCheckResult:
     import asyncio
 
     from morpheyes_daemon.clock import running_clock
     from morpheyes_daemon.devices.link import open_link
-    from morpheyes_daemon.perception.calibration_check import RigCheck
+    from morpheyes_daemon.perception.calibration_check import CalibrationCheck
     from morpheyes_daemon.rig_capture.rig_session import RigSession
 
-    async def session() -> RigCheck:
-        check = RigCheck(rig, (config.camera.width_px, config.camera.height_px))
+    async def session() -> CalibrationCheck:
+        check = CalibrationCheck(rig, (config.camera.width_px, config.camera.height_px))
         async with RigSession.of(config, running_clock(), open_link) as stand:
             low_m, high_m = rig.range_m
             places = [low_m] if low_m == high_m else [low_m, (low_m + high_m) / 2, high_m]
@@ -207,7 +207,7 @@ def _check_live(rig: Any, config: VehicleConfig, frames: int, progress: Any) -> 
     return asyncio.run(session()).result()
 
 
-def _print_check(result: CheckResult) -> None:
+def _print_check(result: CalibrationCheckResult) -> None:
     for one in result.baselines:
         row = one.figures()
         rows = "no texture" if row["epipolar_median_px"] is None else f"rows {row['epipolar_median_px']:.3f} px"
@@ -219,7 +219,7 @@ def _print_check(result: CheckResult) -> None:
         typer.echo(f"disparity bias (yaw): {result.bias_px:+.3f} ± {result.bias_sigma_px:.3f} px")
     for finding in result.findings:
         typer.echo(finding)
-    typer.echo(result.verdict)
+    typer.echo(result.acceptance)
 
 
 def _map(counts: Any) -> str:
@@ -234,10 +234,10 @@ def _say(kept: int, text: str) -> None:
     sys.stderr.flush()
 
 
-def _show(scene: Scene) -> None:
-    """One line that is written over, with a small map of what both eyes have covered."""
+def _show(scene: CaptureStatus) -> None:
+    """One line that is written over, with a small map of what both cameras have covered."""
     guide = scene.guide
-    maps = "  ".join(_map(guide.covered(eye)) for eye in (0, 1))
+    maps = "  ".join(_map(guide.covered(side)) for side in (0, 1))
     line = f"{scene.nominal_m * 1e3:g} mm  {guide.kept}/{guide.wanted}  {scene.hint.text:44} {maps}"
     sys.stderr.write(f"\r\x1b[K{line}" if sys.stderr.isatty() else (f"{line}\n" if scene.hint.kept else ""))
     sys.stderr.flush()

@@ -25,7 +25,7 @@ from morpheyes_daemon.cli.calibrate.options import (
 from morpheyes_daemon.stereo.calibration_file import read_calibration
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.calibration.solver.result import Solved
+    from morpheyes_daemon.calibration.solver.result import CalibrationResult
 
 app = typer.Typer(help="Calibrate the stereo rig and check it.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -64,7 +64,7 @@ def report(
     out: Annotated[Path | None, typer.Option("--out", help="Page to write, .html or .png.")] = None,
     matcher_px: Annotated[float, typer.Option("--matcher-px", min=0.01, max=5, help="Matcher, 1 sigma.")] = 0.25,
     servo_mm: Annotated[float, typer.Option("--servo-mm", min=0, max=5, help="Servo repeatability, 1 sigma.")] = 0.1,
-    sync_ms: Annotated[float, typer.Option("--sync-ms", min=0, max=100, help="Time between the eyes.")] = 2.0,
+    sync_ms: Annotated[float, typer.Option("--sync-ms", min=0, max=100, help="Time between the cameras.")] = 2.0,
     sideways_m_s: Annotated[float, typer.Option("--sideways", min=0, max=20, help="Sideways speed, m/s.")] = 0.5,
 ) -> None:
     """Write a page that shows how good a calibration is, what depth errors to expect, and what to retake."""
@@ -128,7 +128,8 @@ def evaluate(
         Path | None, typer.Option("--separate", help="The rendered folder: also solve every baseline by itself.")
     ] = None,
     watch: Annotated[
-        bool, typer.Option("--watch", help="Also bend the twin, and let its eyes expose late, before the drift watch.")
+        bool,
+        typer.Option("--watch", help="Also bend the twin, and let its cameras expose late, before the drift watch."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -175,14 +176,16 @@ def evaluate(
         f"within {truth.baseline_error_max_mm:.3f} mm; disparity bias within {truth.disparity_bias_max_px:.3f} px"
     )
     near, far = truth.pointing_error_deg
-    typer.echo(f"left eye believed to point {near:.2f} degrees aside at the smallest baseline, {far:.2f} at the largest")
+    typer.echo(
+        f"left camera believed to point {near:.2f} degrees aside at the smallest baseline, {far:.2f} at the largest"
+    )
     if watch:
         _print_watch(figures["watch"])
     for name, row in figures.get("at_calibrated_baselines", {}).items():
         typer.echo(f"{name}: " + ", ".join(f"{key} {value}" for key, value in row.items()))
 
 
-def _print_solved(solved: Solved, out: Path) -> None:
+def _print_solved(solved: CalibrationResult, out: Path) -> None:
     calibration = solved.calibration
     rows = []
     for index, nominal in enumerate(calibration.nominal_m):
@@ -219,7 +222,7 @@ def _print_watch(figures: dict[str, Any]) -> None:
     )
     for late in figures["late"]:
         measured = f"{late['measured_ms']:.2f} ± {late['sigma_ms']:.2f} ms"
-        typer.echo(f"right eye {late['true_ms']:g} ms late: measured {measured}")
+        typer.echo(f"right camera {late['true_ms']:g} ms late: measured {measured}")
 
 
 def _print_table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages.core import Image
-from morpheyes_daemon.stereo.lucas_kanade import follow
+from morpheyes_daemon.stereo.lucas_kanade import LucasKanade
 from morpheyes_daemon.strategies.imo.rectified_frame import Frame
 from morpheyes_daemon.transforms import Array
 
@@ -45,10 +45,8 @@ def followed(before: Image, now: Image, uv: Array, guess: Array) -> tuple[Array,
     if not len(uv):
         return np.empty((0, 2)), np.zeros(0, dtype=np.bool_)
     start = np.where(np.isfinite(guess), guess, uv)
-    return follow(
-        before, now, uv, start,
-        window_px=WINDOW_PX, levels=LEVELS, least_texture=1e-3, rounds=ROUNDS, return_px=BACK_PX,
-    )  # fmt: skip
+    tracker = LucasKanade(WINDOW_PX, LEVELS, min_eigenvalue=1e-3, iterations=ROUNDS, return_px=BACK_PX)
+    return tracker.track(before, now, uv, start)
 
 
 def seen_by_both(frame: Frame, uv: Array, d_guess: Array) -> tuple[Array, Mask]:

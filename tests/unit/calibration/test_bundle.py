@@ -101,7 +101,7 @@ def test_single_stray_corners_are_set_aside_and_their_pictures_kept() -> None:
     seen.left[4, 10] += [3.0, -2.0]
     seen.right[9, 30] += [1.5, 2.0]
     calibration = calibrate(seen)
-    assert calibration.strays == 2
+    assert calibration.stray_corners == 2
     assert not calibration.outliers
 
 

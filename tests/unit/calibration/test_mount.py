@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.mount import ATTITUDES, MountViews, read_mount_folder, solve_mount, ways_up
+from morpheyes_daemon.calibration.mount import ATTITUDES, MountViews, orientations, read_mount_folder, solve_mount
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount
@@ -88,9 +88,9 @@ def test_too_few_pictures_are_refused() -> None:
 
 def test_boards_look_the_same_in_one_two_or_four_ways_up() -> None:
     assert [
-        ways_up(Board(9, 6, 0.025)),
-        ways_up(Board(6, 6, 0.025)),
-        ways_up(Board(9, 6, 0.025, "charuco", "5X5_1000", 0.7)),
+        orientations(Board(9, 6, 0.025)),
+        orientations(Board(6, 6, 0.025)),
+        orientations(Board(9, 6, 0.025, "charuco", "5X5_1000", 0.7)),
     ] == [2, 4, 1]
 
 
@@ -105,7 +105,7 @@ def test_the_twins_eye_is_found_from_its_pictures(folder: Path) -> None:
     twin = RigTwin(640, 480, seed=1)
     views = read_mount_folder(folder, BOARD, twin.cam0)
     assert len(views.names) >= 20
-    found = solve_mount(views, R_FRD_RIG, ways_up(BOARD))
+    found = solve_mount(views, R_FRD_RIG, orientations(BOARD))
     true = rotvec_from_R(twin.T_rig_eye(0, twin.actual_m(RANGE_M[0]))[:3, :3])
     # the eye is 9 mrad off; 3.5 mrad of attitude error in each of two dozen pictures leave about one of each axis
     assert np.linalg.norm(true) > 8e-3

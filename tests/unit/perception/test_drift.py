@@ -10,8 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px
 from morpheyes_daemon.messages.core import BaselineEstimate, Pinhole, StereoFrame
-from morpheyes_daemon.perception.camera_motion import CameraMotion, right_eye_rates, row_rates
-from morpheyes_daemon.perception.extrinsics_monitor import ExtrinsicsFault, ExtrinsicsMonitor, rows_apart_rad, turned_rig
+from morpheyes_daemon.perception.camera_motion import CameraMotion, right_camera_rates, row_rates
+from morpheyes_daemon.perception.extrinsics_monitor import (
+    ExtrinsicsFault,
+    ExtrinsicsMonitor,
+    row_mismatch_rad,
+    turned_rig,
+)
 from morpheyes_daemon.perception.yaw_estimator import leverage
 from morpheyes_daemon.stereo.calibration_file import calibration_hash
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
@@ -47,9 +52,9 @@ def test_rows_are_no_farther_apart_than_a_wrong_baseline_can_make_them() -> None
         rays = [(points @ T[:3, :3].T + T[:3, 3]) @ R_rect_cam1.T for T in (seen, expected)]
         rows = [ray[:, 1] / ray[:, 2] for ray in rays]
         apart = float(np.median(np.abs(rows[0] - rows[1])))
-        bound = rows_apart_rad(rig, nominal_m, true_m)
+        bound = row_mismatch_rad(rig, nominal_m, true_m)
         assert apart <= bound <= 5.0 * apart + 2e-4
-    assert rows_apart_rad(rig, 0.2, 0.2) == pytest.approx(0.0, abs=1e-9)
+    assert row_mismatch_rad(rig, 0.2, 0.2) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_turning_back_gives_the_rig_again() -> None:
@@ -69,7 +74,7 @@ def test_rates_of_the_right_eye_are_those_of_moving_the_rig() -> None:
     T_before_after = pose(R_from_rotvec(w * dt), v * dt)
     moved = points @ inverse(T_before_after)[:3, :3].T + inverse(T_before_after)[:3, 3]
     right = [(p - [b, 0, 0])[:, :2] / p[:, 2:] * pinhole.f_px + middle for p in (points, moved)]
-    rates = right_eye_rates(uv, b * pinhole.f_px / points[:, 2], pinhole, b, motion)
+    rates = right_camera_rates(uv, b * pinhole.f_px / points[:, 2], pinhole, b, motion)
     assert rates == pytest.approx((right[1] - right[0]) / dt, rel=1e-3, abs=1e-2), "first order over a microsecond"
 
 
@@ -113,7 +118,7 @@ def test_eyes_that_expose_far_from_when_they_should_end_trust_in_depth(late_ms: 
     offsets = replace(offsets, dv_px=offsets.dv_px + late_ms / 1e3 * by_travel)
     for _ in range(frames):
         monitor.update(pair, depth, offsets, False, ahead)
-    assert monitor.late is late
+    assert monitor.out_of_sync is late
 
 
 def test_a_pitched_eye_is_told_at_once_and_corrected_ten_frames_later() -> None:
@@ -152,6 +157,6 @@ def test_a_yaw_too_large_for_a_drift_must_be_seen_by_two_pairs_of_frames() -> No
     found = {}
     for pairs in (1, 2):
         monitor._yaw = SimpleNamespace(yaw_rad=yaw_rad, sigma_rad=0.02 * yaw_rad, pairs=pairs)  # type: ignore[assignment]
-        found[pairs] = [finding.what for finding in monitor._judge_yaw(740.0, 0.2)], monitor.broken
-    assert found == {1: ([ExtrinsicsFault.DOUBTED], False), 2: ([ExtrinsicsFault.BROKEN], True)}
+        found[pairs] = [finding.what for finding in monitor._check_yaw(740.0, 0.2)], monitor.broken
+    assert found == {1: ([ExtrinsicsFault.UNCONFIRMED], False), 2: ([ExtrinsicsFault.BROKEN], True)}
     assert calibration_hash(monitor.rig) == calibration_hash(rig), "and nothing was corrected"

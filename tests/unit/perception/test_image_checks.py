@@ -133,8 +133,8 @@ def test_eyes_that_see_different_things_are_told_after_three_frames(pair):
     left, right = pair
     wrong = disparity(left, right) + 12
     check = PairCheck()
-    assert [ask(check, left, right, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.UNLIKE}] * 2
-    assert ask(check, left, right, disparity(left, right)) == {ImageFault.UNLIKE}
+    assert [ask(check, left, right, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.SCENE_MISMATCH}] * 2
+    assert ask(check, left, right, disparity(left, right)) == {ImageFault.SCENE_MISMATCH}
     assert ask(check, left, right, disparity(left, right)) == set(), "two good frames clear it"
 
 
@@ -150,15 +150,15 @@ def test_rows_that_stay_apart_are_told_after_five_frames(pair):
     apart, wrong, good = np.roll(right, 2, axis=0), disparity(left, right), (left, right, disparity(left, right))
     check = PairCheck()
     found = [ask(check, left, apart, wrong) for _ in range(6)]
-    assert found == [set()] * 4 + [{ImageFault.APART}] * 2
-    assert [ask(check, *good) for _ in range(4)] == [{ImageFault.APART}] * 3 + [set()], "four bad frames of eight"
+    assert found == [set()] * 4 + [{ImageFault.ROW_MISMATCH}] * 2
+    assert [ask(check, *good) for _ in range(4)] == [{ImageFault.ROW_MISMATCH}] * 3 + [set()], "four bad frames of eight"
 
 
 def test_few_places_of_which_none_is_found_again_are_told(pair):
     """Swapped eyes in a dense view: hardly a place has a depth at all."""
     nothing = RowOffsets(np.empty((0, 2)), np.empty(0), np.empty(0), tried=45)
     check = PairCheck()
-    assert [check.check(pair[0], nothing, F_PX) for _ in range(3)] == [set(), set(), {ImageFault.UNLIKE}]
+    assert [check.check(pair[0], nothing, F_PX) for _ in range(3)] == [set(), set(), {ImageFault.SCENE_MISMATCH}]
     check, fewer = PairCheck(), replace(nothing, tried=20)
     assert [check.check(pair[0], fewer, F_PX) for _ in range(4)] == [set()] * 4, "too few to say"
 
@@ -177,19 +177,19 @@ def test_rows_far_apart_are_told_after_three_frames_like_eyes_that_see_different
     apart, wrong = np.roll(right, 5, axis=0), disparity(left, right)
     assert row_offsets(left, apart, wrong).count > 0.3 * row_offsets(left, apart, wrong).tried
     check = PairCheck()
-    assert [ask(check, left, apart, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.UNLIKE}] * 2
+    assert [ask(check, left, apart, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.SCENE_MISMATCH}] * 2
 
 
 def test_rows_no_farther_apart_than_the_doubt_in_where_the_eyes_point_are_no_fault(pair):
     left, right = pair
     apart = np.roll(right, 2, axis=0)
     offsets = row_offsets(left, apart, disparity(left, apart))
-    kept = {doubt_rad: PairCheck() for doubt_rad in (0.0, 1e-3, 4e-3)}
+    kept = {row_uncertainty_rad: PairCheck() for row_uncertainty_rad in (0.0, 1e-3, 4e-3)}
     found = {
-        doubt_rad: [check.check(left, offsets, F_PX, doubt_rad) for _ in range(6)][-1]
-        for doubt_rad, check in kept.items()
+        row_uncertainty_rad: [check.check(left, offsets, F_PX, row_uncertainty_rad) for _ in range(6)][-1]
+        for row_uncertainty_rad, check in kept.items()
     }
-    assert found == {0.0: {ImageFault.APART}, 1e-3: {ImageFault.APART}, 4e-3: set()}
+    assert found == {0.0: {ImageFault.ROW_MISMATCH}, 1e-3: {ImageFault.ROW_MISMATCH}, 4e-3: set()}
 
 
 def test_rows_apart_for_a_moment_are_no_fault(pair):

@@ -10,7 +10,7 @@ import pytest
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import RawPair
-from morpheyes_daemon.rig_capture.board_capture import Scene, capture_boards, capture_visits
+from morpheyes_daemon.rig_capture.board_capture import CaptureStatus, capture_boards, capture_visits
 from morpheyes_daemon.simulation.camera.calibration_boards import BoardTwin
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 
@@ -39,8 +39,8 @@ class Table:
         return self._shown[(self.taken - 1) % len(self._shown)]
 
 
-def taken(table: Table, out: Path, wanted: int) -> tuple[dict[str, int], list[Scene]]:
-    scenes: list[Scene] = []
+def taken(table: Table, out: Path, wanted: int) -> tuple[dict[str, int], list[CaptureStatus]]:
+    scenes: list[CaptureStatus] = []
     stand = cast(Any, table)
     counts = asyncio.run(capture_boards(stand, out, BOARD, [0.1, 0.2], wanted, scenes.append))
     return counts, scenes

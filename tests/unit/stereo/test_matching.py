@@ -8,8 +8,8 @@ from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.stereo.matching import (
     MatchSettings,
-    _forget_islands,
     _half_occluded,
+    _remove_islands,
     _runs,
     disparity_range,
     match,
@@ -204,14 +204,14 @@ def test_small_patches_in_the_unknown_are_forgotten_and_branches_are_not():
     disparity[20:24, 20:26] = 30.0
     disparity[:, 47:50] = 25.0
     disparity[40:43, 60:66] = 40.0
-    _forget_islands(disparity, 200, 0.8)
+    _remove_islands(disparity, 200, 0.8)
     assert np.isnan(disparity[20:24, 20:26]).all()
     # the branch has unknown on its left only, the patch on the wall nowhere
     assert (disparity[:, 47:50] == 25.0).all()
     assert (disparity[40:43, 60:66] == 40.0).all()
     large = np.full((60, 80), np.nan, np.float32)
     large[10:40, 10:40] = 5.0
-    _forget_islands(large, 200, 0.8)
+    _remove_islands(large, 200, 0.8)
     assert (large[10:40, 10:40] == 5.0).all()
 
 
