@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from morpheyes_daemon.calibration.mount import solve_mount, orientations
+from morpheyes_daemon.calibration.mount import orientations, solve_mount
 from morpheyes_daemon.calibration.solver.result import rig_model
 from morpheyes_daemon.calibration.solver.solver import calibrate
 from morpheyes_daemon.config.mount_pose import T_frd_rig

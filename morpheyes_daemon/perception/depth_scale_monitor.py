@@ -168,7 +168,7 @@ def _fit(rotated: Array, translation: Array, rays: Array, f_px: float, translati
 
 
 def _derivatives(points: Array, translation: Array) -> tuple[Array, Array]:
-    """Return the derivatives of the directions of points (n, 3) by the factor (n, 2) and by a small rotation (n, 2, 3)."""
+    """Return the derivatives of the directions of points (n, 3) by factor (n, 2) and by small rotation (n, 2, 3)."""
     x, y, z = points.T
     zero, one = np.zeros_like(z), 1.0 / z
     direction = np.stack([np.stack([one, zero, -x / z**2], axis=1), np.stack([zero, one, -y / z**2], axis=1)], axis=1)

@@ -38,7 +38,7 @@ class ImageFault(StrEnum):
     SCENE_MISMATCH = "scene_mismatch", "the cameras do not see the same scene"
     ROW_MISMATCH = (
         "row_mismatch",
-        "the rows of the two images keep differing: unsynchronized cameras, a bent rig, or the calibration of another rig",
+        "the rows of the images keep differing: unsynchronized cameras, bent rig, or another rig's calibration",
     )
 
 

@@ -198,7 +198,7 @@ class YawEstimator:
 
 
 def leverage(baseline_1_m: float, baseline_2_m: float) -> float:
-    """Return the sensitivity of d2 - d1 b2 / b1 to a yaw, relative to its noise (paper-notes 14): 0 at equal baselines."""
+    """Return the sensitivity of d2 - d1 b2 / b1 to a yaw over its noise (paper-notes 14): 0 at equal baselines."""
     ratio = baseline_2_m / baseline_1_m
     return abs(1.0 - ratio) / math.hypot(1.0, ratio)
 

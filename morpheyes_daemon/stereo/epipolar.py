@@ -49,7 +49,7 @@ TURN_RATE_SIGMA_RAD_S = 0.2
 (benchmarks.online_calibration)."""
 
 TIME_OFFSET_SIGMA_S = 5e-4
-"""One sigma, s, below which the measured time offset replaces the expected one; chosen: a quarter of the declared 2 ms."""
+"""One sigma, s, below which the measured time offset replaces the expected one; chosen: a quarter of the usual 2 ms."""
 
 _NOISE_FLOOR_PX = 0.02
 """Least noise of the row offsets of a frame, pixels; chosen: the accuracy of the coarse rectification map is 0.01."""

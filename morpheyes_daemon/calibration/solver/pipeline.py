@@ -1,7 +1,7 @@
-"""`calibrate solve` as a function: a folder of board pictures in, a calibration file and its figures out.
+"""Pipeline of `calibrate solve`: from a folder of board pictures to a calibration file and its figures.
 
-What is wrong with the pictures is named, left out, and kept in the file; only what makes the result worthless
-raises. Corners found are remembered beside the result, so nothing is lost then.
+Unusable pictures are left out and named in the file; only what invalidates the result raises. Detected corners are
+cached beside the result, so they are kept then, too.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from morpheyes_daemon.calibration.solver.acceptance import judge
+from morpheyes_daemon.calibration.solver.acceptance import Quality, judge
 from morpheyes_daemon.calibration.solver.cross_validation import held_out, leave_one_out
 from morpheyes_daemon.calibration.solver.plausibility import ScaleCheck, misnamed, scale_check
 from morpheyes_daemon.calibration.solver.result import CalibrationResult, details, rig_model
@@ -33,9 +33,10 @@ CORNERS_SUFFIX = ".corners.npz"
 def solve_folder(
     root: Path, board: Board, out: Path | None, progress: Progress = silent, header: Mapping[str, Any] | None = None
 ) -> CalibrationResult:
-    """Solve the pictures under `root`; writes `out` when given. Raises InputError or CalibrationError.
+    """Return the calibration from the pictures under `root`, and write it to `out` when given.
 
-    `header` (date, name of the rig) is put first in the file's details.
+    `header` (date, name of the rig) comes first in the file's details. Raises InputError on unusable pictures,
+    CalibrationError as `solve_observations` does and when `out` cannot be written.
     """
     folders, problems = read_folder(root)
     cache = CornerCache(None if out is None else out.with_suffix(CORNERS_SUFFIX))
@@ -49,7 +50,10 @@ def solve_folder(
 def solve_observations(
     observations: Observations, progress: Progress = silent, header: Mapping[str, Any] | None = None
 ) -> CalibrationResult:
-    """Solve, check and judge; raises CalibrationError when the two sizes a person gave cannot both be right."""
+    """Return the calibration of observations with its quality and acceptance.
+
+    Raises CalibrationError when square size and folder names contradict each other, InputError on too few views.
+    """
     calibration, named = _without_misnamed(calibrate(observations, progress), progress)
     lost = observations.lost + named
     scale = scale_check(calibration)
@@ -57,16 +61,19 @@ def solve_observations(
     unseen = held_out(calibration, progress)
     left_out = leave_one_out(calibration, unseen, progress)
     uncertainty = [baseline_uncertainty(calibration, index) for index in range(len(calibration.nominal_m))]
-    verdict = judge(calibration, unseen, left_out, uncertainty, scale, lost)
+    acceptance = judge(calibration, Quality(unseen, left_out, uncertainty, scale), lost)
     rig = rig_model(calibration)
     solved = CalibrationResult(
-        calibration, unseen, left_out, uncertainty, scale, verdict, observations.problems + lost, rig
+        calibration, unseen, left_out, uncertainty, scale, acceptance, observations.problems + lost, rig
     )
     return replace(solved, rig=replace(rig, details={**(header or {}), **details(solved)}))
 
 
 def read_board_file(root: Path) -> Mapping[str, Any]:
-    """Return what `board.yaml` in the folder says (board, square_mm, marker_mm, rig); empty without one."""
+    """Return the content of `board.yaml` in a folder (board, square_mm, marker_mm, rig), empty without one.
+
+    Raises CalibrationError when it cannot be read.
+    """
     path = root / "board.yaml"
     if not path.is_file():
         return {}
@@ -80,7 +87,7 @@ def read_board_file(root: Path) -> Mapping[str, Any]:
 
 
 def _without_misnamed(calibration: Calibration, progress: Progress) -> tuple[Calibration, tuple[str, ...]]:
-    """Solve again without baselines whose length contradicts the folder's name, naming them."""
+    """Return the calibration without baselines that contradict their folder's name, and sentences on these."""
     observations = calibration.observations
     wrong = misnamed(observations.nominal_m, calibration.lengths_m)
     if not wrong:

@@ -1,8 +1,7 @@
-"""How well the solve knows what it found: the covariance of the unknowns carried to what a person asks about.
+"""Uncertainty of a solve: its covariance propagated to the baseline and to the disparity.
 
-Length of the baseline, and the disparity bias at infinity given as an equivalent yaw (yaw and principal points can
-hardly be told apart, but only their joint effect reaches the depth). What the covariance cannot know, such as a
-board that is not flat, is not in it.
+The disparity bias at infinity is also given as an equivalent yaw (yaw and principal points are hardly separable, but
+only their joint effect reaches the depth). Model errors, such as a board that is not flat, are not included.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from morpheyes_daemon.calibration.solver.solver import Calibration
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
 
 _STEP = 1e-2
-"""Of a sigma: the numeric derivative's step; everything is linear over it."""
+"""Step of the numeric derivative, in sigmas; chosen: small enough to be linear, large against rounding."""
 
 
 @dataclass(frozen=True)
 class BaselineUncertainty:
-    """One standard deviation each of what one baseline's geometry is used for."""
+    """One sigma each at one baseline: true baseline, disparity at infinity, and that as a yaw."""
 
     length_m: float
     disparity_px: float
@@ -32,7 +31,10 @@ class BaselineUncertainty:
 
 
 def baseline_uncertainty(calibration: Calibration, index: int) -> BaselineUncertainty:
-    """Return the uncertainty of the baseline's length and of the disparity at infinity there."""
+    """Return the uncertainty of the true baseline and of the disparity at infinity at the baseline of an index.
+
+    First-order propagation of the covariance, J C J^T.
+    """
     solution = calibration.solution
     columns = np.concatenate(
         [np.arange(CAMERA_UNKNOWNS), CAMERA_UNKNOWNS + POSE_UNKNOWNS * index + np.arange(POSE_UNKNOWNS)]
@@ -48,9 +50,9 @@ def baseline_uncertainty(calibration: Calibration, index: int) -> BaselineUncert
 
 
 def camera_uncertainty(calibration: Calibration) -> tuple[dict[str, float], dict[str, float]]:
-    """Return one standard deviation per camera parameter, left and right camera."""
+    """Return one sigma per parameter of the left and of the right camera."""
     sigma = np.sqrt(np.diag(calibration.solution.covariance)[:CAMERA_UNKNOWNS]).reshape(2, -1)
-    left, right = (dict(zip(CAMERA_PARAMETERS, map(float, side), strict=True)) for side in sigma)
+    left, right = (dict(zip(CAMERA_PARAMETERS, map(float, values), strict=True)) for values in sigma)
     return left, right
 
 

@@ -1,4 +1,4 @@
-"""`morpheyes calibrate mount`: where the cameras point on the vehicle, from pictures and attitudes."""
+"""`morpheyes calibrate mount`: orientation of the cameras on the vehicle, from pictures and attitudes."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def mount(
     marker_mm: MarkerOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure how the left camera is turned on the vehicle, and write it into the calibration file.
+    """Measure the orientation of the left camera on the vehicle, and write it into the calibration file.
 
-    Half a degree that nobody knows of is 35 mm aside at 4 m: it decides whether a gap is met in its middle.
+    An unknown error of half a degree misplaces an opening by 35 mm at a distance of 4 m.
     """
     from dataclasses import replace
 
@@ -61,7 +61,7 @@ def _figures(found: MountSolution, views: MountViews) -> dict[str, object]:
         "rotation_deg": [round(math.degrees(angle), 4) for angle in found.mount.rotation_rad],
         "sigma_deg": [round(math.degrees(angle), 4) for angle in found.mount.sigma_rad],
         "rms_deg": round(math.degrees(found.rms_rad), 4),
-        "turned_deg": round(math.degrees(found.turned_rad), 1),
+        "turned_deg": round(math.degrees(found.rotation_spread_rad), 1),
         "problems": list(views.problems),
     }
 
@@ -69,10 +69,12 @@ def _figures(found: MountSolution, views: MountViews) -> dict[str, object]:
 def _print(found: MountSolution, views: MountViews, written: Path) -> None:
     names = ("up", "right", "clockwise")
     for name, angle, sigma in zip(names, found.mount.rotation_rad, found.mount.sigma_rad, strict=True):
-        typer.echo(f"the left camera is turned {name} by {math.degrees(angle):+.2f} ± {math.degrees(sigma):.2f} degrees")
+        typer.echo(
+            f"the left camera is rotated {name} by {math.degrees(angle):+.2f} ± {math.degrees(sigma):.2f} degrees"
+        )
     typer.echo(
-        f"from {len(views.names)} pictures, vehicle turned by {math.degrees(found.turned_rad):.0f} degrees; attitude "
-        f"and board differ by {math.degrees(found.rms_rad):.2f} degrees in a picture"
+        f"from {len(views.names)} pictures, vehicle rotated by {math.degrees(found.rotation_spread_rad):.0f} degrees; "
+        f"attitude and board differ by {math.degrees(found.rms_rad):.2f} degrees in a picture"
     )
     for problem in views.problems:
         typer.echo(f"left out: {problem}", err=True)

@@ -49,7 +49,9 @@ def test_without_errors_the_rotation_is_found_exactly() -> None:
     found = solve_mount(turned(12, 0.5, 0.0), R_FRD_RIG, 2)
     assert off_rad(found.mount) < 1e-9
     assert found.rms_rad < 1e-9
-    assert math.degrees(found.turned_rad) == pytest.approx(50.0, abs=10.0)  # half a radian about each of three axes
+    assert math.degrees(found.rotation_spread_rad) == pytest.approx(
+        50.0, abs=10.0
+    )  # half a radian about each of three axes
 
 
 def test_what_is_left_of_an_attitudes_error_is_what_it_says() -> None:

@@ -175,7 +175,7 @@ def test_the_eyes_mount_is_measured_and_written_into_the_file(tmp_path: Path, te
     assert before == pytest.approx(0.61, abs=0.02)
     assert after < 0.25
     code, out, _ = terminal("mount", file, held)
-    assert "the left eye is turned up by -0." in out
+    assert "the left camera is rotated up by -0." in out
     assert read_calibration(file).mount is not None
 
 

@@ -138,9 +138,9 @@ def test_a_smaller_range_reports_the_rest_as_near(panel_before_wall):
 
 def test_pixels_that_the_eyes_do_not_cover_are_unknown(slanted):
     left, right, truth = slanted
-    left_seen, right_seen = np.ones(left.shape, bool), np.ones(left.shape, bool)
-    left_seen[:20], right_seen[:, :50], right_seen[:, 300:] = False, False, False
-    found = match(left, right, 64, left_seen=left_seen, right_seen=right_seen)
+    in_left, in_right = np.ones(left.shape, bool), np.ones(left.shape, bool)
+    in_left[:20], in_right[:, :50], in_right[:, 300:] = False, False, False
+    found = match(left, right, 64, covered=(in_left, in_right))
     partner = np.arange(320) - truth
     assert not np.isfinite(found.disparity_px[:20]).any()
     assert not found.near[:20].any()

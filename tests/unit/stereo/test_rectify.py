@@ -115,16 +115,16 @@ def test_seen_is_where_the_raw_image_reaches():
     for eye in (rectification.cam0, rectification.cam1):
         u, v = eye.map_px[..., 0], eye.map_px[..., 1]
         inside = (u >= 0) & (u <= 639) & (v >= 0) & (v <= 479)
-        assert eye.seen is not None
+        assert eye.covered is not None
         # linear interpolation of the distance to the edge moves it by less than the maps' own error
-        assert np.mean(eye.seen != inside) < 1e-3
-        assert 0.9 < eye.seen.mean() < 1.0
+        assert np.mean(eye.covered != inside) < 1e-3
+        assert 0.9 < eye.covered.mean() < 1.0
 
 
 def test_a_view_that_fits_everywhere_has_no_mask():
     barrel = CameraIntrinsics(640, 480, 740.0, 740.0, 319.5, 239.5, 0.0, (-0.2, 0.05, 0.0, 0.0, 0.0))
     rig = RigModel.from_poses(barrel, barrel, [0.2], [pose(np.eye(3), np.array([0.2, 0.0, 0.0]))])
-    assert rectify(rig, 0.2).cam0.seen is None
+    assert rectify(rig, 0.2).cam0.covered is None
 
 
 def test_rays_and_pixels_are_each_others_inverse():
