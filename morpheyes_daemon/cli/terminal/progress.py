@@ -1,4 +1,4 @@
-"""A progress line on standard error for long work; nothing when nobody looks at it."""
+"""Progress bars on standard error; nothing without a terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from morpheyes_daemon.progress import Progress
 
 @contextmanager
 def progress_line() -> Iterator[Progress]:
-    """Yield a callback that moves a bar with the remaining time; one bar per kind of work."""
+    """Yield a callback that updates a bar with the remaining time; one bar per step."""
     from rich import progress as rich
     from rich.console import Console
 
