@@ -15,7 +15,7 @@ def command(
     out: Annotated[Path, typer.Option(help="Folder for the pictures and analysis.json.")] = Path("out/analysis"),
     as_json: Annotated[bool, typer.Option("--json", help="Print all numbers as JSON.")] = False,
 ) -> None:
-    """Draw the depth error, the errors of a wrong calibration (figures 2, 3, table I) and the speed bounds (figure 5)."""
+    """Draw the depth error, the errors of a wrong calibration (figures 2, 3, table I) and speed bounds (figure 5)."""
     import json
 
     from morpheyes_daemon.errors import InputError

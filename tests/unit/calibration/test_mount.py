@@ -1,4 +1,4 @@
-"""How the left eye sits on the vehicle, from attitudes and boards: found, refused when it cannot be, kept in the file."""
+"""How the left camera sits on the vehicle, from attitudes and boards: found, refused when it cannot be, kept in the file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BOARD = Board(9, 6, 0.025)
 
 
 def turned(n: int, spread_rad: float, noise_rad: float, stray: int = 0) -> MountViews:
-    """Attitudes about a level one, and the board that an eye with the TRUE rotation sees, some of them upside down."""
+    """Attitudes about a level one, and the board that a camera with the TRUE rotation sees, some of them upside down."""
     rng = np.random.default_rng(5)
     R_ned_frd = np.array([R_from_rotvec(rng.normal(0.0, spread_rad, 3)) for _ in range(n)])
     wall = R_FRD_RIG @ R_from_rotvec(np.array([0.1, 0.2, 0.0]))
@@ -103,13 +103,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_the_twins_eye_is_found_from_its_pictures(folder: Path) -> None:
+def test_the_twins_camera_is_found_from_its_pictures(folder: Path) -> None:
     twin = RigTwin(640, 480, seed=1)
     views = read_mount_folder(folder, BOARD, twin.cam0)
     assert len(views.names) >= 20
     found = solve_mount(views, R_FRD_RIG, orientations(BOARD))
     true = rotvec_from_R(twin.T_rig_eye(0, twin.actual_m(RANGE_M[0]))[:3, :3])
-    # the eye is 9 mrad off; 3.5 mrad of attitude error in each of two dozen pictures leave about one of each axis
+    # the camera is 9 mrad off; 3.5 mrad of attitude error in each of two dozen pictures leave about one of each axis
     assert np.linalg.norm(true) > 8e-3
     assert off_rad(found.mount, true) < 4e-3
 
@@ -147,7 +147,7 @@ def test_a_folder_without_attitudes_says_how_to_take_them(tmp_path: Path) -> Non
         read_mount_folder(tmp_path, BOARD, RigTwin(640, 480, seed=1).cam0)
 
 
-def test_the_file_keeps_it_and_the_rectified_eye_points_there(tmp_path: Path) -> None:
+def test_the_file_keeps_it_and_the_rectified_camera_points_there(tmp_path: Path) -> None:
     rig = RigTwin(640, 480, seed=1).exact_rig(3)
     mounted = replace(rig, mount=CameraMount((0.009, -0.006, 0.004), (1e-3, 1e-3, 1e-3)))
     write_calibration(mounted, tmp_path / "rig.yaml")

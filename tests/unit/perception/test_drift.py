@@ -41,7 +41,7 @@ def test_a_rig_turned_by_a_yaw_shows_that_much_disparity_at_infinity() -> None:
 
 
 def test_rows_are_no_farther_apart_than_a_wrong_baseline_can_make_them() -> None:
-    """Directions of things three metres off, as the right eye sees them and as it should for the baseline believed."""
+    """Directions of things three metres off, as the right camera sees them and as it should for the baseline believed."""
     rig = RigModel.from_poses(CAM0, CAM1, TEN_M.tolist(), [true_pose(b) for b in TEN_M])
     x, y = np.meshgrid([-0.4, 0.0, 0.4], [-0.3, 0.0, 0.3])
     points = 3.0 * np.stack([x.ravel(), y.ravel(), np.ones(9)], axis=1)
@@ -64,7 +64,7 @@ def test_turning_back_gives_the_rig_again() -> None:
     assert again.T_cam0_cam1(0.17) == pytest.approx(rig.T_cam0_cam1(0.17), abs=1e-9)
 
 
-def test_rates_of_the_right_eye_are_those_of_moving_the_rig() -> None:
+def test_rates_of_the_right_camera_are_those_of_moving_the_rig() -> None:
     pinhole, b = Pinhole(640, 480, 740.0, 319.5, 239.5), 0.25
     v, w, dt = np.array([0.4, -0.3, 2.0]), np.array([0.2, -0.3, 0.4]), 1e-6
     motion = CameraMotion(np.eye(4), v, w)
@@ -90,7 +90,7 @@ SMALL = crooked_rig(320, 240)
 def watched(
     pitch_deg: float, panels: list[Panel], frames: int, moving: bool = False
 ) -> tuple[ExtrinsicsMonitor, list[ExtrinsicsFault]]:
-    """A monitor that has seen the same still pair for so many frames, the right eye having turned since."""
+    """A monitor that has seen the same still pair for so many frames, the right camera having turned since."""
     monitor = ExtrinsicsMonitor(turned_rig(SMALL, -np.radians([pitch_deg, 0.0, 0.0]), 0.2))
     estimator = DepthEstimator(monitor.rig)
     at = BaselineEstimate(0, 0.2, 0.2, 1e-4, moving)
@@ -105,7 +105,9 @@ def watched(
 
 @pytest.mark.parametrize(("late_ms", "frames", "late"), [(2.0, 9, False), (5.0, 9, False), (7.0, 2, False),
                                                           (7.0, 3, True), (20.0, 3, True)])  # fmt: skip
-def test_eyes_that_expose_far_from_when_they_should_end_trust_in_depth(late_ms: float, frames: int, late: bool) -> None:
+def test_cameras_that_expose_far_from_when_they_should_end_trust_in_depth(
+    late_ms: float, frames: int, late: bool
+) -> None:
     """Declared are 2 ms; the rows are moved as flying ahead at 3 m/s moves them in that time."""
     monitor = ExtrinsicsMonitor(SMALL)
     estimator = DepthEstimator(SMALL)
@@ -121,7 +123,7 @@ def test_eyes_that_expose_far_from_when_they_should_end_trust_in_depth(late_ms: 
     assert monitor.out_of_sync is late
 
 
-def test_a_pitched_eye_is_told_at_once_and_corrected_ten_frames_later() -> None:
+def test_a_pitched_camera_is_told_at_once_and_corrected_ten_frames_later() -> None:
     monitor, told = watched(0.15, WORLD, frames=11)
     assert told == [ExtrinsicsFault.ROWS, ExtrinsicsFault.TURNED]
     turned_back = inverse(SMALL.T_cam0_cam1(0.2)) @ monitor.rig.T_cam0_cam1(0.2)
@@ -145,7 +147,7 @@ def test_nothing_is_corrected_while_the_servo_moves() -> None:
     assert ExtrinsicsFault.TURNED not in told
 
 
-def test_an_eye_that_turned_far_is_broken_and_not_mended() -> None:
+def test_a_camera_that_turned_far_is_broken_and_not_mended() -> None:
     monitor, told = watched(0.3, WORLD, frames=15)
     assert told == [ExtrinsicsFault.ROWS, ExtrinsicsFault.BROKEN]
     assert monitor.broken

@@ -16,7 +16,7 @@ F_PX = 370.0
 
 
 def checked(pitch_deg: float, yaw_deg: float, panels_at: dict[float, list[Panel]]) -> CalibrationCheckResult:
-    """What the check says when the right eye has turned since the calibration, by so much."""
+    """What the check says when the right camera has turned since the calibration, by so much."""
     believed = turned_rig(RIG, -np.radians([pitch_deg, yaw_deg, 0.0]), 0.2)
     check = CalibrationCheck(believed, (320, 240))
     for baseline_m, panels in panels_at.items():
@@ -53,7 +53,7 @@ def test_a_scene_that_moves_tells_nothing_of_the_yaw() -> None:
 def test_a_bare_wall_is_said_to_tell_nothing() -> None:
     result = checked(0.15, 0.15, {0.1: [Panel(3.0, contrast=0.01)], 0.3: [Panel(3.0, contrast=0.01)]})
     assert all(one.figures()["epipolar_median_px"] is None for one in result.baselines)
-    assert "look at something else" in result.findings[0]
+    assert "point the cameras at another scene" in result.findings[0]
 
 
 def test_no_pictures_and_baselines_outside_are_errors() -> None:

@@ -31,7 +31,7 @@ TEXTURE = texture()
 def sight(
     t_s: float, way_m: np.ndarray, turn_rad: np.ndarray, told_turn_rad: np.ndarray, v: np.ndarray
 ) -> ScaleObservation:
-    """The wall from an eye that has gone `way_m` and turned; the autopilot tells `told_turn_rad` and `v`."""
+    """The wall from a camera that has gone `way_m` and turned; the autopilot tells `told_turn_rad` and `v`."""
     v_pixel, u_pixel = np.mgrid[0:240, 0:320]
     x, y = (u_pixel - PINHOLE.cx_px) / PINHOLE.f_px, (v_pixel - PINHOLE.cy_px) / PINHOLE.f_px
     R = R_from_rotvec(turn_rad)
@@ -40,7 +40,7 @@ def sight(
     places = way_m + rays * along[..., None]
     maps = ((places[..., i] * 100.0 + centre).astype(np.float32) for i, centre in ((0, 400.0), (1, 300.0)))
     image = cv2.remap(TEXTURE, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-    depth = along.astype(np.float32)  # along the optical axis, since a ray's third part is 1 in the eye's own axes
+    depth = along.astype(np.float32)  # along the optical axis, since a ray's third part is 1 in the camera's own axes
     told = R_from_rotvec(told_turn_rad)
     return ScaleObservation(
         image.astype(np.uint8), depth_map(t_s, depth), CameraMotion(pose(told, way_m), told.T @ v, np.zeros(3))

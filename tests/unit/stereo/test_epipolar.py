@@ -1,4 +1,4 @@
-"""Rows of both eyes: measured to a few hundredths of a pixel, and told apart by cause."""
+"""Rows of both cameras: measured to a few hundredths of a pixel, and told apart by cause."""
 
 import math
 
@@ -30,7 +30,7 @@ def test_aligned_rows_have_no_offset():
 
 
 @pytest.mark.parametrize("pitch_deg", [-0.2, 0.05, 0.15, 0.3])
-def test_a_pitched_eye_is_recovered(pitch_deg):
+def test_a_pitched_camera_is_recovered(pitch_deg):
     offsets = measured(turned_right((math.radians(pitch_deg), 0.0, 0.0)))
     fit = RowOffsetEstimator().add(offsets, PINHOLE)
     # 0.3 degrees are 1.9 px; a fortieth of a pixel is 0.004 degrees
@@ -41,7 +41,7 @@ def test_a_pitched_eye_is_recovered(pitch_deg):
 
 
 @pytest.mark.parametrize("roll_deg", [-0.3, 0.2])
-def test_a_rolled_eye_is_recovered(roll_deg):
+def test_a_rolled_camera_is_recovered(roll_deg):
     offsets = measured(turned_right((0.0, 0.0, math.radians(roll_deg))))
     fit = RowOffsetEstimator().add(offsets, PINHOLE)
     assert math.degrees(fit.roll_rad) == pytest.approx(roll_deg, abs=0.008)
@@ -57,10 +57,10 @@ MOTION = (np.array([0.3, -0.2, 2.5]), np.array([0.25, 0.1, -0.15]))
 
 
 def moved(time_offset_s):
-    """How the right eye stands, seen from where it should, when it exposes late."""
+    """How the right camera stands, seen from where it should, when it exposes late."""
     v, w = MOTION
     R = R_from_rotvec(w * time_offset_s)
-    # the eye sits at b along x on a rig that turns about the left eye
+    # the camera sits at b along x on a rig that turns about the left camera
     at_right = np.array([B, 0.0, 0.0])
     return pose(R, v * time_offset_s + R @ at_right - at_right)
 

@@ -76,7 +76,7 @@ def test_it_beats_the_plain_matcher_and_loses_no_columns(slanted):
     assert np.median(np.abs(ours - truth)[shared]) < 0.75 * np.median(np.abs(plain - truth)[shared])
 
 
-def test_only_what_the_right_eye_cannot_see_is_lost_at_the_left_edge(panel_before_wall):
+def test_only_what_the_right_camera_cannot_see_is_lost_at_the_left_edge(panel_before_wall):
     left, right, truth = panel_before_wall
     found = match(left, right, 64)
     column = np.arange(320)
@@ -87,7 +87,7 @@ def test_only_what_the_right_eye_cannot_see_is_lost_at_the_left_edge(panel_befor
     assert found.half_occluded[outside].mean() > 0.9
 
 
-def test_what_a_nearer_panel_hides_from_the_right_eye_is_told(panel_before_wall):
+def test_what_a_nearer_panel_hides_from_the_right_camera_is_told(panel_before_wall):
     left, right, truth = panel_before_wall
     found = match(left, right, 64)
     partner = np.arange(320) - truth
@@ -136,7 +136,7 @@ def test_a_smaller_range_reports_the_rest_as_near(panel_before_wall):
     assert np.isfinite(found.disparity_px[(truth < 13) & (np.arange(320) > 200)]).mean() > 0.9
 
 
-def test_pixels_that_the_eyes_do_not_cover_are_unknown(slanted):
+def test_pixels_that_the_cameras_do_not_cover_are_unknown(slanted):
     left, right, truth = slanted
     in_left, in_right = np.ones(left.shape, bool), np.ones(left.shape, bool)
     in_left[:20], in_right[:, :50], in_right[:, 300:] = False, False, False

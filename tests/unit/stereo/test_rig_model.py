@@ -93,7 +93,7 @@ def test_rigs_that_cannot_be_are_refused(nominal, poses, words):
         RigModel.from_poses(LENS, LENS, nominal, poses)
 
 
-def test_eyes_of_different_size_are_refused():
+def test_cameras_of_different_size_are_refused():
     with pytest.raises(CalibrationError, match="same image size"):
         RigModel.from_poses(LENS, LENS.rescaled(320, 240), [0.1], [straight_pose(0.1)])
 

@@ -52,7 +52,7 @@ def test_the_near_limits_are_those_of_the_notes():
 
 
 def disparity_after(z, b, f, u, moved_m, sideways_m=0.0, yaw_rad=0.0):
-    """Disparity of the point that the left eye sees at column u, if the right eye has moved by then."""
+    """Disparity of the point that the left camera sees at column u, if the right camera has moved by then."""
     x = u * z / f
     p = np.array([x - b - sideways_m, 0.0, z - moved_m])
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -154,7 +154,7 @@ def test_a_lens_own_numbers_are_what_errors_are_percent_of():
     assert intrinsic_error(lens, "k1", 1.0).x_px == pytest.approx(3 * intrinsic_error(paper_lens(4.0), "k1", 1.0).x_px)
 
 
-def test_rotation_errors_move_the_right_eye_by_what_the_angle_says():
+def test_rotation_errors_move_the_right_camera_by_what_the_angle_says():
     pair = paper_pair(16.0)
     f = pair.cam0.fx
     # in the middle of the image pitch and yaw move by f per radian; the corner adds (y / f)^2 and x y / f^2
@@ -188,7 +188,7 @@ def test_a_rig_is_analysed_with_its_own_numbers():
     assert next(row for row in intrinsic if row["parameter"] == "k1")["nominal"] == -0.18
     pairs = {row["pair"] for row in numbers["calibration_error"]["extrinsic"]}
     assert pairs == {"100 mm", "200 mm", "300 mm"}
-    # turning the right eye leaves the left image alone on any rig
+    # turning the right camera leaves the left image alone on any rig
     assert numbers["table_1"]["extrinsic"]["x"]["theta"] == 0.0
 
 
