@@ -84,7 +84,7 @@ def test_a_smaller_image_has_the_same_poses():
         ([], [], "at least one"),
         ([0.2, 0.1], [straight_pose(0.2), straight_pose(0.1)], "must grow"),
         ([0.1, 0.1], [straight_pose(0.1), straight_pose(0.1)], "none twice"),
-        ([0.1], [straight_pose(-0.1)], "swapped"),
+        ([0.1], [straight_pose(-0.1)], "exchange the left and right images"),
         ([0.1], [straight_pose(np.nan)], "not finite"),
     ],
 )
