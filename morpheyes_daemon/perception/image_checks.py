@@ -24,6 +24,7 @@ class ImageFault(StrEnum):
     text: str
 
     def __new__(cls, code: str, text: str) -> ImageFault:
+        """Return the member of a code with its text."""
         member = str.__new__(cls, code)
         member._value_ = code
         member.text = text
@@ -201,7 +202,7 @@ def _small(image: Image) -> Image:
 def _matched_share(left: Image, right: Image) -> float:
     """Return the fraction of a coarse pair that matches with a disparity of at least one pixel."""
     settings = MatchSettings()
-    disparity = semi_global(left, right, 0, _COARSE_DISPARITIES, settings, settings.coarse_speckle_px)
+    disparity = semi_global(left, right, range(_COARSE_DISPARITIES), settings, settings.coarse_speckle_px)
     return float(np.mean(disparity >= 1.0))
 
 

@@ -71,6 +71,7 @@ class PipelineFactory:
     calibration: Path
 
     def __call__(self) -> Pipeline:
+        """Return the pipeline; raises CalibrationError or ConfigError when a file is invalid."""
         return Pipeline(self.config, self.mission, read_calibration(self.calibration))
 
 

@@ -41,6 +41,7 @@ MIN_NEW_ROTATION_RAD = math.radians(8.0)
 ATTITUDE_TIMEOUT_S = 10.0
 """Longest wait for the first attitude, seconds; chosen: the heartbeats of an autopilot come every second."""
 _POLLS_PER_S = 20
+"""Checks for the first attitude per second; chosen: within one period of usual telemetry."""
 
 Show = Callable[[int, str], None]
 """Called with the number of kept pictures and the advice after every pair."""

@@ -23,6 +23,7 @@ from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, CameraMount, RigModel
 
 FORMAT = "morpheyes-calibration-1"
+"""Version of the file format, in its key `format`."""
 
 _HEADER = """\
 # Calibration of a stereo rig, as `morpheyes calibrate` writes and the daemon reads it.

@@ -16,6 +16,7 @@ from morpheyes_daemon.stereo.still import StillDepth, halves
 NEAR_BGR, HALF_OCCLUDED_BGR = (235, 235, 235), (96, 84, 78)
 INK, GREY = "#30343a", "#888888"
 WIDTH_IN, DPI = 9.0, 150
+"""Colours of the figure, its width in inches and its dots per inch; chosen: readable in print and on screen."""
 
 
 def read_pair(left: Path, right: Path | None) -> tuple[Image, Image]:

@@ -124,7 +124,7 @@ def match(
     if step > 1:
         left, right = _downsampled(left, 1, step), _downsampled(right, 1, step)
     speckle_px = round(left.size * settings.speckle_per_image)
-    disparity = semi_global(left, right, min_disparity, num_disparities, settings, speckle_px)
+    disparity = semi_global(left, right, range(min_disparity, ceiling), settings, speckle_px)
     near |= disparity > ceiling - CEILING_MARGIN_PX
     disparity[near] = np.nan
     _remove_uncovered(disparity, near, _rows_of(covered[0], step), _rows_of(covered[1], step))
@@ -137,15 +137,15 @@ def match(
     return Match(disparity, near, half_occluded, float(ceiling))
 
 
-def semi_global(left: Image, right: Image, low: int, count: int, settings: MatchSettings, speckle_px: int) -> FloatMap:
+def semi_global(left: Image, right: Image, search: range, settings: MatchSettings, speckle_px: int) -> FloatMap:
     """Return the disparity (H, W) float32 of left pixels, NaN where unknown or outside the right image.
 
-    Searches `count` disparities from `low` on; patches below `speckle_px` pixels are removed (OpenCV, StereoSGBM).
+    `search` are the disparities in pixels; patches below `speckle_px` pixels are removed (OpenCV, StereoSGBM).
     """
     block_area = settings.block_px**2
     matcher = cv2.StereoSGBM.create(
-        minDisparity=low,
-        numDisparities=count,
+        minDisparity=search.start,
+        numDisparities=len(search),
         blockSize=settings.block_px,
         P1=settings.small_step_penalty * block_area,
         P2=settings.large_step_penalty * block_area,
@@ -156,12 +156,12 @@ def semi_global(left: Image, right: Image, low: int, count: int, settings: Match
         speckleRange=1,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    before, after = max(0, low + count), max(0, -low)
+    before, after = max(0, search.stop), max(0, -search.start)
     padded = [cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE) for image in (left, right)]
     fixed = np.asarray(matcher.compute(*padded), dtype=np.int16)[:, before : before + left.shape[1]]
     disparity = fixed.astype(np.float32) / np.float32(SUBPIXELS) + _CORRECTION_PX[fixed & (SUBPIXELS - 1)]
     column = np.arange(left.shape[1], dtype=np.float32)
-    disparity[(fixed < low * SUBPIXELS) | (disparity > column + 0.5)] = np.nan
+    disparity[(fixed < search.start * SUBPIXELS) | (disparity > column + 0.5)] = np.nan
     return np.asarray(disparity)
 
 
@@ -171,7 +171,8 @@ def _beyond_ceiling(left: Image, right: Image, low: int, count: int, settings: M
     scale = max(1, round(width / settings.coarse_width_px))
     small_left, small_right = (_downsampled(image, scale, COARSE_ROW_FACTOR * scale) for image in (left, right))
     reach = disparity_range(count * settings.coarse_range / scale, small_left.shape[1])
-    coarse = semi_global(small_left, small_right, low // scale, reach, settings, settings.coarse_speckle_px)
+    search = range(low // scale, low // scale + reach)
+    coarse = semi_global(small_left, small_right, search, settings, settings.coarse_speckle_px)
     beyond = coarse * scale > low + count + scale / 2
     return _upsampled(beyond, scale, COARSE_ROW_FACTOR * scale, (height, width))
 

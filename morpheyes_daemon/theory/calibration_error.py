@@ -39,6 +39,7 @@ GRID_POINTS = 65
 """Points per side of the grid of errors; chosen: the errors are smooth over 2 pixels."""
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5")
+"""Names of the distortion coefficients in the paper's order."""
 
 ERROR_PCT = 1.0
 ERROR_DEG = 0.1

@@ -11,6 +11,7 @@ from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.transforms import Array
 
 CAMERA_PARAMETERS = ("fx_px", "fy_px", "cx_px", "cy_px", "alpha", "k1", "k2", "k3", "k4", "k5")
+"""Names of the components of a camera vector (10,)."""
 
 
 def camera_vector(camera: CameraIntrinsics) -> Array:

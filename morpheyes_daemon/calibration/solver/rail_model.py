@@ -21,8 +21,7 @@ FEWEST_BASELINES = 4
 """Fewest baselines for a rail model; chosen: with three a line leaves one degree of freedom."""
 _HIGHEST_ORDER = 4
 """Highest polynomial order; chosen: higher ones oscillate between ten baselines."""
-_SCATTER_RAD = np.geomspace(1e-6, 1e-2, 25)
-_SCATTER_M = np.geomspace(1e-6, 1e-2, 25)
+_SCATTER_RAD = _SCATTER_M = np.geomspace(1e-6, 1e-2, 25)
 """Candidates of the scatter, rad and metres; chosen: from far below to far above any servo, 1.5 times apart."""
 
 

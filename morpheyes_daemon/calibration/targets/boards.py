@@ -77,7 +77,7 @@ class Board:
 
     @property
     def points_m(self) -> Array:
-        """Inner corners (columns * rows, 3) in the board's frame, row by row, z = 0."""
+        """Inner corners (n, 3), n = columns * rows, in the board's frame, metres, row by row, z = 0."""
         v, u = np.mgrid[0 : self.rows, 0 : self.columns]
         flat = np.stack([u.ravel(), v.ravel(), np.zeros(u.size)], axis=-1)
         return np.asarray(flat * self.square_m, dtype=np.float64)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from morpheyes_daemon.config.vehicle import VehicleConfig
     from morpheyes_daemon.messages.core import Image
     from morpheyes_daemon.perception.calibration_check import CalibrationCheck, CalibrationCheckResult
-    from morpheyes_daemon.rig_capture.board_capture import CaptureStatus
+    from morpheyes_daemon.rig_capture.board_capture import BoardFolder, CaptureStatus
 
 
 def capture(
@@ -58,39 +58,50 @@ def capture(
     from morpheyes_daemon.calibration.solver.pipeline import read_board_file
     from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
     from morpheyes_daemon.cli.calibrate.options import choose_baselines_m, choose_board
-    from morpheyes_daemon.clock import running_clock
     from morpheyes_daemon.config.packaged import load_config
-    from morpheyes_daemon.devices.link import open_link
-    from morpheyes_daemon.rig_capture.board_capture import BoardFolder, capture_boards, capture_visits
-    from morpheyes_daemon.rig_capture.mount_capture import AttitudeSource, HandHeldVehicle, capture_mount
-    from morpheyes_daemon.rig_capture.rig_session import RigSession
+    from morpheyes_daemon.rig_capture.board_capture import BoardFolder
 
     vehicle = load_config(config)
     known = read_board_file(out) if out.is_dir() else {}
     chosen = choose_board(known, board, square_mm, marker_mm, ask=not as_json and sys.stdin.isatty())
     low_m, high_m = vehicle.baseline_range_m
     nominal_m = [low_m] if low_m == high_m else choose_baselines_m(baselines_mm, (low_m, high_m))
-
     folder = BoardFolder(out, chosen)
-
-    async def run() -> dict[str, int]:
-        clock = running_clock()
-        async with RigSession.of(vehicle, clock, open_link) as session:
-            if mount:
-                async with HandHeldVehicle(vehicle, clock, open_link) as held:
-                    source = AttitudeSource(lambda: held.state, clock)
-                    kept = await capture_mount(session, source, folder, views or MOUNT_VIEWS, _show_attitudes)
-                return {out.name: kept}
-            if visits:
-                return await capture_visits(session, folder, nominal_m, visits, _show)
-            return await capture_boards(session, folder, nominal_m, views or BASELINE_VIEWS, _show)
-
-    counts = asyncio.run(run())
+    if mount:
+        counts = asyncio.run(_capture_mount(vehicle, folder, views or MOUNT_VIEWS))
+    else:
+        counts = asyncio.run(_capture_boards(vehicle, folder, nominal_m, views or BASELINE_VIEWS, visits))
     if as_json:
         typer.echo(json.dumps({"folder": str(out), "pairs": counts}, indent=2))
     else:
         following = f"mount FILE {out}" if mount else f"solve {out}"
         typer.echo(f"{sum(counts.values())} pairs are in {out}; next: morpheyes calibrate {following}")
+
+
+async def _capture_mount(config: VehicleConfig, folder: BoardFolder, wanted: int) -> dict[str, int]:
+    from morpheyes_daemon.clock import running_clock
+    from morpheyes_daemon.devices.link import open_link
+    from morpheyes_daemon.rig_capture.mount_capture import AttitudeSource, HandHeldVehicle, capture_mount
+    from morpheyes_daemon.rig_capture.rig_session import RigSession
+
+    clock = running_clock()
+    async with RigSession.of(config, clock, open_link) as session, HandHeldVehicle(config, clock, open_link) as held:
+        source = AttitudeSource(lambda: held.state, clock)
+        return {folder.path.name: await capture_mount(session, source, folder, wanted, _show_attitudes)}
+
+
+async def _capture_boards(
+    config: VehicleConfig, folder: BoardFolder, nominal_m: list[float], wanted: int, visits: int
+) -> dict[str, int]:
+    from morpheyes_daemon.clock import running_clock
+    from morpheyes_daemon.devices.link import open_link
+    from morpheyes_daemon.rig_capture.board_capture import capture_boards, capture_visits
+    from morpheyes_daemon.rig_capture.rig_session import RigSession
+
+    async with RigSession.of(config, running_clock(), open_link) as session:
+        if visits:
+            return await capture_visits(session, folder, nominal_m, visits, _show)
+        return await capture_boards(session, folder, nominal_m, wanted, _show)
 
 
 def check(

@@ -25,6 +25,7 @@ from morpheyes_daemon.cli.calibrate.options import (
 from morpheyes_daemon.stereo.calibration_file import read_calibration
 
 if TYPE_CHECKING:
+    from morpheyes_daemon.benchmarks.calibration_error import RigTruth
     from morpheyes_daemon.calibration.solver.result import CalibrationResult
 
 app = typer.Typer(help="Calibrate the stereo rig and check it.", no_args_is_help=True, rich_markup_mode=None)
@@ -166,6 +167,14 @@ def evaluate(
     if as_json:
         typer.echo(json.dumps(figures, indent=2))
         return
+    _print_truth(truth)
+    if watch:
+        _print_watch(figures["watch"])
+    for name, row in figures.get("at_calibrated_baselines", {}).items():
+        typer.echo(f"{name}: " + ", ".join(f"{key} {value}" for key, value in row.items()))
+
+
+def _print_truth(truth: RigTruth) -> None:
     _print_table(
         ("baseline", "row error, median", "row error, 95 %", "length error", "disparity bias"),
         [
@@ -187,10 +196,6 @@ def evaluate(
     typer.echo(
         f"pointing error of the left camera {near:.2f} degrees at the smallest baseline, {far:.2f} at the largest"
     )
-    if watch:
-        _print_watch(figures["watch"])
-    for name, row in figures.get("at_calibrated_baselines", {}).items():
-        typer.echo(f"{name}: " + ", ".join(f"{key} {value}" for key, value in row.items()))
 
 
 def _print_solved(solved: CalibrationResult, out: Path) -> None:
