@@ -14,9 +14,7 @@ if TYPE_CHECKING:
 
 def command(
     mission: Annotated[str, typer.Argument(help="A shipped mission by name, or a mission file.")],
-    baselines: Annotated[
-        str, typer.Option(help="Comma-separated: 'variable' and fixed baselines in metres.")
-    ] = "variable",
+    baselines: Annotated[str, typer.Option(help="'variable' and fixed ones in metres, with commas.")] = "variable",
     seeds: Annotated[str, typer.Option(help="One seed or an inclusive range.")] = "0-9",
     rate_hz: Annotated[float, typer.Option(min=0.2, max=60.0, help="Stereo pairs per second.")] = 5.0,
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "320x240",

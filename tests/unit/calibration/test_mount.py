@@ -69,7 +69,7 @@ def test_a_few_attitudes_that_are_quite_wrong_hardly_count() -> None:
 
 
 def test_a_vehicle_that_was_hardly_turned_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="turn the vehicle farther"):
+    with pytest.raises(CalibrationError, match="rotate the vehicle farther"):
         solve_mount(turned(30, 0.03, 3.5e-3), R_FRD_RIG, 2)
 
 
@@ -79,7 +79,7 @@ def test_a_vehicle_that_was_turned_about_one_axis_or_none_is_refused(axes: tuple
     attitudes = [R_from_rotvec(np.array(axes) * 0.1 * k) for k in range(12)]
     wall = R_FRD_RIG
     seen = [(attitude @ R_FRD_RIG @ R_from_rotvec(TRUE)).T @ wall for attitude in attitudes]
-    with pytest.raises(CalibrationError, match="turn the vehicle farther"):
+    with pytest.raises(CalibrationError, match="rotate the vehicle farther"):
         solve_mount(replace(views, R_ned_frd=np.array(attitudes), R_cam0_board=np.array(seen)), R_FRD_RIG, 2)
 
 
@@ -131,9 +131,9 @@ def test_pictures_that_cannot_be_used_are_named_and_left_out(folder: Path, tmp_p
     ("text", "said"),
     [
         ("picture,roll_deg,pitch_deg\n", "needs the columns picture, roll_deg, pitch_deg, yaw_deg"),
-        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1,2,x\n", "line 2: the angles are no numbers"),
-        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1,2,nan\n", "line 2: the angles are no numbers"),
-        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1\n", "line 2: the angles are no numbers"),
+        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1,2,x\n", "line 2: the angles are not numbers"),
+        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1,2,nan\n", "line 2: the angles are not numbers"),
+        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1\n", "line 2: the angles are not numbers"),
     ],
 )
 def test_a_bad_list_of_attitudes_is_refused_naming_the_line(tmp_path: Path, text: str, said: str) -> None:
