@@ -81,7 +81,7 @@ class HandHeldVehicle:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeSource:
-    """Reads the newest vehicle state; `clock` tells its age."""
+    """Reads the newest vehicle state; `clock` gives its age."""
 
     read: Callable[[], VehicleState]
     clock: Clock

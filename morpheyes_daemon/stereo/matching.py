@@ -1,9 +1,9 @@
 """Dense matching of a rectified pair: disparity, and for unknown pixels whether they are too near or half-occluded.
 
 Semi-global matching is OpenCV's (StereoSGBM, Hirschmüller 2008, three path directions), on images padded so that
-only what the right camera cannot see is lost. What is nearer than the largest disparity has no match at all, and the
-matcher then often invents a far one; so a coarse search over a longer range runs beside it, finds such regions and
-overrules the fine one there. The result does not depend on the number of threads.
+only pixels outside the right image are lost. Objects nearer than the largest disparity have no match, and the matcher
+often finds a false, far one there; so a coarse search over a longer range detects such regions and overrules the
+fine search. The result does not depend on the number of threads.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ def draw(found: list[Position]) -> Figure:
     mean = np.array([position.mean_m for position in found]) * 1e3
     band = _BAND_SIGMAS * np.array([position.sigma_m for position in found]) * 1e3
     for ax, offset in ((above, np.zeros_like(target)), (below, target)):
-        ax.fill_median_pose(target, mean - offset - band, mean - offset + band, color="#2f6fde", alpha=0.25, lw=0)
+        ax.fill_between(target, mean - offset - band, mean - offset + band, color="#2f6fde", alpha=0.25, lw=0)
         ax.plot(target, mean - offset, "o-", color="#1b3f87", ms=4)
         ax.grid(color="#e3e7ec")
         ax.spines[["top", "right"]].set_visible(False)
