@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+"""Vectors, matrices and point sets."""
 
 R_FRD_CAM: Array = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Camera axes (x right, y down, z forward) in a body frame (x forward, y right, z down)."""
+"""Rotation (3, 3) from camera axes (x right, y down, z forward) to body axes (x forward, y right, z down)."""
 
 
 def R_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
@@ -32,7 +33,7 @@ def R_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
 
 
 def rpy_from_R(R_ned_frd: Array) -> tuple[float, float, float]:
-    """Return (roll, pitch, yaw) in radians of R_ned_frd."""
+    """Return (roll, pitch, yaw) in radians of R_ned_frd (3, 3): aerospace Z-Y-X Euler angles."""
     pitch = math.asin(max(-1.0, min(1.0, -float(R_ned_frd[2, 0]))))
     return (
         math.atan2(float(R_ned_frd[2, 1]), float(R_ned_frd[2, 2])),
@@ -42,7 +43,7 @@ def rpy_from_R(R_ned_frd: Array) -> tuple[float, float, float]:
 
 
 def R_from_rotvec(rotvec_rad: Array) -> Array:
-    """Return the rotation (3, 3) of a rotation vector (3,) by Rodrigues' formula."""
+    """Return the rotation (3, 3) of a rotation vector (3,) in radians (Rodrigues' formula)."""
     angle = float(np.linalg.norm(rotvec_rad))
     if angle < 1e-12:
         return np.eye(3) + skew(rotvec_rad)
@@ -56,7 +57,7 @@ def skew(v: Array) -> Array:
 
 
 def q_from_R(R: Array) -> Array:
-    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (Shepperd's method)."""
+    """Return the unit quaternion (4,), (w, x, y, z) with w >= 0, of a rotation matrix (3, 3) (Shepperd 1978)."""
     trace = float(np.trace(R))
     choices = np.array([trace, R[0, 0], R[1, 1], R[2, 2]])
     i = int(np.argmax(choices))
@@ -74,7 +75,7 @@ def q_from_R(R: Array) -> Array:
 
 
 def R_from_q(q: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a unit quaternion (w, x, y, z)."""
+    """Return the rotation matrix (3, 3) of a unit quaternion (4,), (w, x, y, z)."""
     w, x, y, z = (float(c) for c in q)
     return np.array(
         [
@@ -86,7 +87,7 @@ def R_from_q(q: Array) -> Array:
 
 
 def rotvec_from_R(R: Array) -> Array:
-    """Return the rotation vector (3,), at most pi long, of a rotation matrix (3, 3)."""
+    """Return the rotation vector (3,) in radians, of norm at most pi, of a rotation matrix (3, 3)."""
     q = q_from_R(R)
     sine = float(np.linalg.norm(q[1:]))
     return np.asarray(q[1:] * (2.0 if sine < 1e-12 else 2.0 * np.arctan2(sine, q[0]) / sine))
@@ -101,7 +102,7 @@ def pose(R: Array, t: Array) -> Array:
 
 
 def inverse(T_a_b: Array) -> Array:
-    """Return T_b_a of a rigid T_a_b."""
+    """Return T_b_a (4, 4) of a rigid transform T_a_b (4, 4)."""
     R = T_a_b[:3, :3]
     return pose(R.T, -R.T @ T_a_b[:3, 3])
 

@@ -24,9 +24,9 @@ from morpheyes_daemon.calibration.solver.solver import solve_separately
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.calibration.targets.detection import observe
 from morpheyes_daemon.calibration.targets.image_pairs import read_folder
-from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.flights.sim_boards import twin_from_name
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.simulation.camera.true_rig import RANGE_M, RigTwin
 from morpheyes_daemon.stereo.rectify import homogeneous
 from morpheyes_daemon.stereo.rig import RigModel

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from morpheyes_daemon.benchmarks.calibration_error import evaluate_rig
-from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount, ServoMotion
 from morpheyes_daemon.messages.core import BaselineEstimate, StereoFrame, VehicleState
 from morpheyes_daemon.perception.camera_motion import CameraMotion, camera_motion
 from morpheyes_daemon.perception.extrinsics_monitor import ExtrinsicsLimits, ExtrinsicsMonitor, ExtrinsicsReport
-from morpheyes_daemon.perception.yaw_estimator import STILL, Uncertain
+from morpheyes_daemon.perception.yaw_estimator import STATIONARY, MotionUncertainty
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.simulation.camera.stereo_camera import CameraTwin, Sensor
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.simulation.rendering.renderer import Renderer
@@ -77,12 +77,14 @@ class LateTrial:
 class _Watched:
     """The watch with what it needs around it: camera twin, depth, rig as corrected so far."""
 
-    def __init__(self, rig: RigModel, twin: RigTwin, late_s: float, seed: int, uncertain: Uncertain | None) -> None:
+    def __init__(
+        self, rig: RigModel, twin: RigTwin, time_offset_s: float, seed: int, uncertain: MotionUncertainty | None
+    ) -> None:
         world = build_world(load_world("forest"), seed)
         north, east, _ = world.start_ned_m
         self.start_ned_m = np.array([north, east, -_HEIGHT_M])
         self._twin = twin
-        self._camera = CameraTwin(Renderer(world.scene), twin, Mount(), Sensor(sync_offset_s=late_s), seed)
+        self._camera = CameraTwin(Renderer(world.scene), twin, Mount(), Sensor(sync_offset_s=time_offset_s), seed)
         self.monitor = ExtrinsicsMonitor(rig, ExtrinsicsLimits(), uncertain)
         self._estimator = DepthEstimator(rig)
 
@@ -104,14 +106,14 @@ class _Watched:
             motion = camera_motion(state, mounted, depth.T_rig_rect)
         report = self.monitor.update(rectified, depth, offsets, False, motion)
         if report.rig_changed:
-            self._estimator = self._estimator.turned(self.monitor.rig)
+            self._estimator = self._estimator.with_rig(self.monitor.rig)
         return report
 
 
 def drift_trial(rig: RigModel, seed: int, bent_deg: float = BENT_DEG, progress: Progress = silent) -> DriftTrial:
     """Bend the twin of `seed` in pitch and yaw, let the watch look at it for 20 frames at two baselines."""
     bent = RigTwin(*rig.size, seed=seed).bent(math.radians(bent_deg), math.radians(bent_deg))
-    watched = _Watched(rig, bent, 0.0, seed, STILL)
+    watched = _Watched(rig, bent, 0.0, seed, STATIONARY)
     place = pose(np.eye(3), watched.start_ned_m)
     told: dict[str, int] = {}
     said: list[str] = []
@@ -139,15 +141,15 @@ def drift_trial(rig: RigModel, seed: int, bent_deg: float = BENT_DEG, progress: 
 
 def late_trials(rig: RigModel, seed: int, progress: Progress = silent) -> Iterator[LateTrial]:
     """Fly 20 frames with each time of `LATE_S` between the eyes, 2 ms declared, and yield what was measured."""
-    for done, late_s in enumerate(LATE_S):
+    for done, time_offset_s in enumerate(LATE_S):
         progress("measuring the time between the eyes", done, len(LATE_S))
-        watched = _Watched(rig, RigTwin(*rig.size, seed=seed), late_s, seed, None)
+        watched = _Watched(rig, RigTwin(*rig.size, seed=seed), time_offset_s, seed, None)
         flight = _Flight(watched.start_ned_m - _RUN_UP_M, seed)
         for number in range(FRAMES):
             t_ns = round(number * S / _RATE_HZ)
             report = watched.look(number, t_ns, _PLACES_M[1], flight.T_ned_frd, flight.reported(t_ns))
-        measured_ms, sigma_ms = round(report.late_s * 1e3, 3), round(report.late_sigma_s * 1e3, 3)
-        yield LateTrial(late_s * 1e3, measured_ms, sigma_ms, watched.monitor.late)
+        measured_ms, sigma_ms = round(report.time_offset_s * 1e3, 3), round(report.time_offset_sigma_s * 1e3, 3)
+        yield LateTrial(time_offset_s * 1e3, measured_ms, sigma_ms, watched.monitor.out_of_sync)
 
 
 class _Flight:

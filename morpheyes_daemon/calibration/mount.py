@@ -1,8 +1,9 @@
-"""How the left eye is turned on the vehicle, from a board that stands still before a vehicle that is turned by hand.
+"""Orientation of the left camera on the vehicle, from a fixed board in front of a vehicle that is rotated by hand.
 
-Boards alone tell the eyes from each other; where they point on the body decides where an opening is believed to be.
-The autopilot's attitude and the board's pose in the left eye turn together, and what lies between them is the eye's
-rotation on the body (rotation part of robot-world hand-eye calibration, A X B = Y; Shah 2013). No position is used.
+Boards alone determine the cameras relative to each other; their direction on the body decides where an opening is
+placed. The autopilot's attitude and the board's pose in the left camera rotate together, and the constant rotation
+between them is the camera's orientation on the body (rotation part of robot-world hand-eye calibration, A X B = Y;
+Shah, "Solving the robot-world/hand-eye calibration problem using the Kronecker product", 2013). No position is used.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ import numpy as np
 
 from morpheyes_daemon.calibration.solver.initial_guess import board_pose
 from morpheyes_daemon.calibration.targets.boards import Board, find_corners
-from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.messages.core import Image
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import CameraMount
 from morpheyes_daemon.transforms import Array, R_from_rotvec, R_from_rpy, rotvec_from_R
@@ -29,19 +30,25 @@ ATTITUDES = "attitudes.csv"
 COLUMNS = ("picture", "roll_deg", "pitch_deg", "yaw_deg")
 
 MOUNT_VIEWS, FEWEST_VIEWS = 48, 10
-"""Pictures to take, and to work with at least."""
+"""Pictures to take, and the least to solve from; chosen: more take longer and average the attitude's noise."""
 
 WORST_SIGMA_RAD = 4e-3
-"""One sigma of a rotation that is no better than a careful builder's eye."""
+"""Largest accepted sigma of the orientation, rad; chosen: a camera mounted with care is as precise without it."""
 
-_ROUNDS = 20
-_STRAY = 3.0
-"""A view whose rotations disagree by so many times the median counts less and less."""
+_ROUNDS, _CONVERGED_RAD = 20, 1e-10
+"""Most Gauss-Newton steps, and the step that ends them."""
+_OUTLIER_FACTOR = 3.0
+"""Residual of a view, in medians, from which Huber's loss is linear; chosen: smaller rejects noisy attitudes."""
+_SINGULAR = 1e-6
+"""Ratio of eigenvalues below which a rotation axis was not excited; chosen: far below that of any hand-held set."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountViews:
-    """The vehicle's attitudes R_ned_frd (n, 3, 3) and the board in the left eye, R_cam0_board (n, 3, 3)."""
+    """Attitudes R_ned_frd (n, 3, 3) of the vehicle and orientations R_cam0_board (n, 3, 3) of the board.
+
+    `problems` are sentences on pictures that were left out.
+    """
 
     names: tuple[str, ...]
     R_ned_frd: Array
@@ -51,62 +58,63 @@ class MountViews:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountSolution:
-    """The left eye's rotation on the bar; `rms_rad` is what is left between attitude and board in a view."""
+    """Orientation of the left camera on the bar; `rms_rad` is the residual between attitude and board per view."""
 
     mount: CameraMount
     rms_rad: float
-    turned_rad: float
-    """How far the vehicle was turned, root mean square about the middle of its attitudes."""
+    rotation_spread_rad: float
+    """Rms rotation of the vehicle about the mean of its attitudes."""
 
 
-def solve_mount(views: MountViews, R_frd_rig: Array, turns: int) -> MountSolution:
-    """Return the rotation of the left eye on a bar that sits on the body as `R_frd_rig` (3, 3) says.
+def solve_mount(views: MountViews, R_frd_rig: Array, orientations: int) -> MountSolution:
+    """Return the orientation of the left camera on a bar whose orientation on the body is `R_frd_rig` (3, 3).
 
-    `turns` is the board's `ways_up`. Gauss-Newton on rotation vectors with Huber's weights. Raises CalibrationError
-    when views are too few or the vehicle was hardly turned.
+    `orientations` is that of the board (`orientations(board)`). Gauss-Newton on rotation vectors with Huber weights
+    (Shah 2013). Raises CalibrationError when there are too few views or the vehicle was hardly rotated.
     """
     if len(views.names) < FEWEST_VIEWS:
         raise CalibrationError(
             f"{len(views.names)} pictures show the board, {FEWEST_VIEWS} are needed: take more, from all sides."
         )
     A = views.R_ned_frd @ R_frd_rig
-    B = _same_way_up(A, views.R_cam0_board, turns)
+    B = _in_one_orientation(A, views.R_cam0_board, orientations)
     X, Y = np.eye(3), A[0] @ B[0]
     J = np.concatenate([B.transpose(0, 2, 1), np.broadcast_to(-np.eye(3), B.shape)], axis=2).reshape(-1, 6)
     for _ in range(_ROUNDS):
-        off = _off(A, X, B, Y)
-        weight = np.repeat(np.sqrt(_huber(np.linalg.norm(off, axis=1))), 3)
-        step = np.linalg.lstsq(J * weight[:, None], -off.ravel() * weight, rcond=None)[0]
+        residual = _residuals(A, X, B, Y)
+        weight = np.repeat(np.sqrt(_huber(np.linalg.norm(residual, axis=1))), 3)
+        step = np.linalg.lstsq(J * weight[:, None], -residual.ravel() * weight, rcond=None)[0]
         X, Y = X @ R_from_rotvec(step[:3]), Y @ R_from_rotvec(step[3:])
-        if np.abs(step).max() < 1e-10:
+        if np.abs(step).max() < _CONVERGED_RAD:
             break
-    rms = math.sqrt(float(((off.ravel() * weight) ** 2).sum() / ((weight**2).sum() - 6)))
+    rms = math.sqrt(float(((residual.ravel() * weight) ** 2).sum() / ((weight**2).sum() - 6)))
     sigma = rms * _sigmas((J * weight[:, None]).T @ (J * weight[:, None]))
-    turned = _turned_rad(A)
+    spread_rad = _rotation_spread_rad(A)
     if not sigma.max() <= WORST_SIGMA_RAD:
         raise CalibrationError(
-            f"The eye's rotation is only known to {math.degrees(float(sigma.max())):.2f} degrees: turn the vehicle "
-            f"farther (these pictures: {math.degrees(turned):.0f} degrees) about all three axes, and hold it still."
+            f"The camera's orientation is only known to {math.degrees(float(sigma.max())):.2f} degrees: "
+            f"rotate the vehicle farther (these pictures: {math.degrees(spread_rad):.0f} degrees) "
+            "about all three axes, and hold it still."
         )
     x = rotvec_from_R(X)
     mount = CameraMount((float(x[0]), float(x[1]), float(x[2])), (float(sigma[0]), float(sigma[1]), float(sigma[2])))
-    return MountSolution(mount, rms, turned)
+    return MountSolution(mount, rms, spread_rad)
 
 
 def read_mount_folder(folder: Path, board: Board, cam0: CameraIntrinsics, progress: Progress = silent) -> MountViews:
-    """Return the views of a folder that holds left pictures and `attitudes.csv`.
+    """Return the views of a folder with left pictures and `attitudes.csv`.
 
-    What cannot be used is named and left out. Raises InputError when there is no such file or a row is not
-    understood.
+    Unusable pictures are left out and named in `problems`. Raises InputError when the file is missing or a row is
+    invalid.
     """
     names, attitudes, boards, problems = [], [], [], []
     rows = list(attitude_rows(folder / ATTITUDES))
     for done, (name, attitude) in enumerate(rows, start=1):
         image = cv2.imread(str(folder / name), cv2.IMREAD_COLOR)
         if image is None:
-            problems.append(f"{folder / name}: is not a readable picture; copy it again or take out its row.")
+            problems.append(f"{folder / name}: is not a readable picture; copy it again or delete its row.")
         elif (seen := board_rotation(np.asarray(image, np.uint8), board, cam0)) is None:
-            problems.append(f"{folder / name}: shows no whole board and is left out.")
+            problems.append(f"{folder / name}: shows no complete board and is left out.")
         else:
             names.append(name)
             attitudes.append(attitude)
@@ -117,7 +125,7 @@ def read_mount_folder(folder: Path, board: Board, cam0: CameraIntrinsics, progre
 
 
 def board_rotation(image: Image, board: Board, cam0: CameraIntrinsics) -> Array | None:
-    """Return R_cam0_board (3, 3) of the board in a picture of the left eye, None when it is not seen."""
+    """Return R_cam0_board (3, 3) of the board in a picture (H, W[, 3]) of the left camera, None when it is not found."""
     corners = find_corners(image, board)
     if corners is None:
         return None
@@ -126,8 +134,8 @@ def board_rotation(image: Image, board: Board, cam0: CameraIntrinsics) -> Array 
     return None if T_cam0_board is None else T_cam0_board[:3, :3]
 
 
-def ways_up(board: Board) -> int:
-    """Return in how many ways up a board looks the same."""
+def orientations(board: Board) -> int:
+    """Return the number of rotations about its normal under which the board looks the same: 1, 2 or 4."""
     if board.kind == "charuco":
         return 1
     return 4 if board.rows == board.columns else 2
@@ -150,37 +158,37 @@ def attitude_rows(path: Path) -> Iterator[tuple[str, Array]]:
         except (TypeError, ValueError):
             angles = [math.nan]
         if not all(math.isfinite(angle) for angle in angles):
-            raise InputError(f"{path}, line {number}: the angles are no numbers; correct the line or take it out.")
+            raise InputError(f"{path}, line {number}: the angles are not numbers; correct or delete the line.")
         yield str(row["picture"]), R_from_rpy(*angles)
 
 
-def _same_way_up(A: Array, B: Array, turns: int) -> Array:
-    """Return the board's rotations as of one and the same corner: it looks alike when turned about its normal."""
-    about = [R_from_rotvec(np.array([0.0, 0.0, 2 * math.pi * k / turns])) for k in range(turns)]
+def _in_one_orientation(A: Array, B: Array, orientations: int) -> Array:
+    """Return the board orientations B (n, 3, 3) resolved to one corner: the board is symmetric about its normal."""
+    about = [R_from_rotvec(np.array([0.0, 0.0, 2 * math.pi * k / orientations])) for k in range(orientations)]
     ways = B[:, None] @ np.array(about)
-    likeness = np.einsum("ij,nkij->nk", A[0] @ B[0], A[:, None] @ ways)
-    return np.asarray(ways[np.arange(len(B)), likeness.argmax(axis=1)])
+    agreement = np.einsum("ij,nkij->nk", A[0] @ B[0], A[:, None] @ ways)
+    return np.asarray(ways[np.arange(len(B)), agreement.argmax(axis=1)])
 
 
-def _off(A: Array, X: Array, B: Array, Y: Array) -> Array:
-    """Return what is missing (n, 3) in A X B = Y, as rotation vectors in the board's axes."""
+def _residuals(A: Array, X: Array, B: Array, Y: Array) -> Array:
+    """Return the residuals (n, 3) of A X B = Y, rotation vectors in board axes."""
     return np.array([rotvec_from_R(R) for R in Y.T @ A @ X @ B])
 
 
-def _huber(off: Array) -> Array:
-    limit = _STRAY * max(float(np.median(off)), 1e-9)
-    return np.asarray(np.minimum(1.0, limit / np.maximum(off, 1e-12)))
+def _huber(residual: Array) -> Array:
+    limit = _OUTLIER_FACTOR * max(float(np.median(residual)), 1e-9)
+    return np.asarray(np.minimum(1.0, limit / np.maximum(residual, 1e-12)))
 
 
 def _sigmas(information: Array) -> Array:
-    """Return one sigma (3,) of the eye's rotation for unit noise, infinite where the vehicle was not turned at all."""
+    """Return one sigma (3,) of the orientation for unit noise; inf where the vehicle was not rotated."""
     values, vectors = np.linalg.eigh(information)
-    if values[0] < 1e-6 * values[-1]:
+    if values[0] < _SINGULAR * values[-1]:
         return np.full(3, np.inf)
     return np.asarray(np.sqrt(np.diag(vectors / values @ vectors.T)[:3]))
 
 
-def _turned_rad(A: Array) -> float:
-    """Return the root mean square angle of the attitudes about their middle."""
+def _rotation_spread_rad(A: Array) -> float:
+    """Return the rms angle of the attitudes A (n, 3, 3) about their mean."""
     vectors = np.array([rotvec_from_R(A[0].T @ R) for R in A])
     return math.sqrt(float(((vectors - vectors.mean(axis=0)) ** 2).sum(axis=1).mean()))

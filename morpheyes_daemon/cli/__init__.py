@@ -1,4 +1,4 @@
-"""The command line: arguments only. One file per command; heavy imports wait until a command runs."""
+"""The command line: arguments only. One module per command; heavy imports are deferred until a command runs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COMMANDS = (
     "report",
     "config",
 )
-"""In the order of `morpheyes --help`; each is a module here with `command` (a function) or `app` (a group)."""
+"""Commands in the order of `morpheyes --help`; each is a module here with `command` (a function) or `app` (a group)."""
 
 
 def _version(asked: bool) -> None:
@@ -37,10 +37,10 @@ def _version(asked: bool) -> None:
 
 
 def build() -> typer.Typer:
-    """Return the whole command line."""
+    """Return the command line; raises ModuleNotFoundError when the module of a command is missing."""
     root = typer.Typer(
         name="morpheyes",
-        help="The onboard daemon of a quadrotor whose stereo eyes move apart, and its simulator.",
+        help="The onboard daemon of a quadrotor with a variable-baseline stereo camera, and its simulator.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
@@ -54,12 +54,7 @@ def build() -> typer.Typer:
         """Fly a mission in the simulator with `morpheyes sim forest`; run the daemon with `morpheyes run`."""
 
     for name in COMMANDS:
-        try:
-            module = importlib.import_module(f"{__name__}.{name}")
-        except ModuleNotFoundError as error:
-            if error.name != f"{__name__}.{name}":
-                raise
-            continue
+        module = importlib.import_module(f"{__name__}.{name}")
         if hasattr(module, "app"):
             root.add_typer(module.app, name=name)
         else:
@@ -68,7 +63,7 @@ def build() -> typer.Typer:
 
 
 def main() -> None:
-    """Run the command line; an error a person can act on becomes one sentence and its exit code."""
+    """Run the command line; a MorphEyesError becomes one sentence and its exit code."""
     try:
         build()()
     except MorphEyesError as error:

@@ -1,4 +1,4 @@
-"""`morpheyes analyze`: the paper's section II from our own code, for its rig or yours."""
+"""`morpheyes analyze`: the error analysis of the paper (section II), for its rig or a calibrated one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def command(
     out: Annotated[Path, typer.Option(help="Folder for the pictures and analysis.json.")] = Path("out/analysis"),
     as_json: Annotated[bool, typer.Option("--json", help="Print all numbers as JSON.")] = False,
 ) -> None:
-    """Draw the depth error, the errors of a wrong calibration (figures 2, 3, table I) and the bounds on speed (5)."""
+    """Draw the depth error, the errors of a wrong calibration (figures 2, 3, table I) and speed bounds (figure 5)."""
     import json
 
     from morpheyes_daemon.errors import InputError

@@ -14,7 +14,7 @@ app = typer.Typer(help="Check and show configuration and mission files.", no_arg
 @app.command()
 def check(
     files: Annotated[
-        list[Path] | None, typer.Argument(help="Files to check; none: ./config.yaml and every shipped mission.")
+        list[Path] | None, typer.Argument(help="Files to check; default: ./config.yaml and every shipped mission.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
@@ -38,18 +38,20 @@ def check(
         typer.echo(json.dumps(rows, indent=2))
     else:
         for name, found in errors.items():
-            typer.echo("\n".join(found) or f"{name}: good", err=bool(found))
+            typer.echo("\n".join(found) or f"{name}: valid", err=bool(found))
     if any(errors.values()):
         raise typer.Exit(2)
 
 
 @app.command()
 def show(
-    file: Annotated[Path | None, typer.Argument(help="config.yaml or a mission; none: the one in use.")] = None,
-    keys: Annotated[bool, typer.Option("--keys", help="Every key with its bounds and meaning.")] = False,
+    file: Annotated[
+        Path | None, typer.Argument(help="config.yaml or a mission; default: the configuration in use.")
+    ] = None,
+    keys: Annotated[bool, typer.Option("--keys", help="List every key with its bounds and meaning.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print as JSON.")] = False,
 ) -> None:
-    """Show a file with every default filled in, or with --keys what each key may be."""
+    """Show a file with all defaults, or with --keys the bounds and meaning of each key."""
     import yaml
 
     from morpheyes_daemon.config.packaged import load_config
@@ -73,7 +75,7 @@ def show(
 
 
 def _is_mission(file: Path) -> bool:
-    """A mission file names its strategy; everything else is taken for a vehicle configuration."""
+    """Return whether a file is a mission: it names a strategy; everything else is a vehicle configuration."""
     import yaml
 
     from morpheyes_daemon.config.yaml_reader import parse_yaml, read_text

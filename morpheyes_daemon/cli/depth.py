@@ -1,4 +1,4 @@
-"""`morpheyes depth`: the depth of any pair of pictures, or of one side-by-side picture."""
+"""`morpheyes depth`: depth of a stereo pair in files, or of one side-by-side picture."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from morpheyes_daemon.stereo.calibration_file import read_calibration
 
 
 def command(
-    left: Annotated[Path, typer.Argument(help="Left picture, or one with both eyes side by side.")],
+    left: Annotated[Path, typer.Argument(help="Left picture, or one side-by-side picture.")],
     right: Annotated[Path | None, typer.Argument(help="Right picture.")] = None,
-    focal_px: Annotated[float | None, typer.Option(help="Focal length of rectified pictures.")] = None,
-    baseline_m: Annotated[float | None, typer.Option(help="Distance between the eyes; nominal with a rig.")] = None,
-    doffs_px: Annotated[float, typer.Option(help="Difference of the principal points, x right - x left.")] = 0.0,
-    calibration: Annotated[Path | None, typer.Option(help="Calibration file; the pictures are raw then.")] = None,
-    near_m: Annotated[float | None, typer.Option(help="Nearest depth to look for.")] = None,
+    focal_px: Annotated[float | None, typer.Option(help="Focal length of rectified pictures, pixels.")] = None,
+    baseline_m: Annotated[
+        float | None, typer.Option(help="Baseline, metres; with --calibration the nominal one.")
+    ] = None,
+    doffs_px: Annotated[float, typer.Option(help="Difference of the principal points, x right - x left, pixels.")] = 0.0,
+    calibration: Annotated[Path | None, typer.Option(help="Calibration file, for raw pictures.")] = None,
+    near_m: Annotated[float | None, typer.Option(help="Nearest depth to search, metres.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for depth.npy and depth.png.")] = Path("out/depth"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
 ) -> None:
-    """Compute the depth of a pair of pictures, in metres, and colour it."""
+    """Compute the depth of a stereo pair in metres, and draw it."""
     import json
 
     from morpheyes_daemon.clock import stopwatch_s
@@ -31,7 +33,7 @@ def command(
 
     _require_positive(**{"--focal-px": focal_px, "--baseline-m": baseline_m, "--near-m": near_m})
     if calibration is not None and (focal_px is not None or doffs_px != 0.0):
-        raise UsageError("--calibration knows the focal length and the offset; leave out --focal-px and --doffs-px.")
+        raise UsageError("--calibration contains the focal length and the offset; leave out --focal-px and --doffs-px.")
     pair = read_pair(left, right)
     if calibration is not None:
         rig = read_calibration(calibration)
@@ -41,7 +43,7 @@ def command(
         started_s = stopwatch_s()
         depth = rectified_depth(*pair, f_px=focal_px, baseline_m=baseline_m, doffs_px=doffs_px, near_m=near_m)
     else:
-        raise UsageError("Say --focal-px and --baseline-m for rectified pictures, or --calibration for raw ones.")
+        raise UsageError("Give --focal-px and --baseline-m for rectified pictures, or --calibration for raw ones.")
     time_s = stopwatch_s() - started_s
     files = write_depth(out, depth, left.name)
     statistics = {
@@ -61,7 +63,7 @@ def command(
         return
     median = "none" if depth.median_depth_m is None else f"{depth.median_depth_m:.2f} m"
     typer.echo(f"depth for {100 * depth.valid_fraction:.1f} % of the pixels, median {median}, in {time_s:.2f} s")
-    typer.echo(f"nearest that can be seen {depth.near_limit_m:.2f} m; {100 * depth.ceiling_fraction:.1f} % is nearer")
+    typer.echo(f"near limit {depth.near_limit_m:.2f} m; {100 * depth.ceiling_fraction:.1f} % of the pixels are nearer")
     for file in files:
         typer.echo(str(file))
 

@@ -1,4 +1,4 @@
-"""`morpheyes faults`: break everything that can break, in every state, and see how it ends."""
+"""`morpheyes faults`: flies the fault matrix, every fault in every state of the safety monitor."""
 
 from __future__ import annotations
 
@@ -10,20 +10,18 @@ import typer
 
 
 def command(
-    only: Annotated[str | None, typer.Option(help="Faults whose name begins like this; default: all.")] = None,
+    only: Annotated[str | None, typer.Option(help="Prefix of the faults to fly; default: all.")] = None,
     seeds: Annotated[str, typer.Option(help="Seeds, one or a range such as 0-2.")] = "0-2",
     jobs: Annotated[int, typer.Option(min=1, help="Faults flown at the same time.")] = 2,
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "320x240",
     calibration: Annotated[str, typer.Option(help="'solved', 'mounted', 'exact', or a calibration file.")] = "exact",
-    out: Annotated[Path | None, typer.Option(help="Also write the table here, as docs/faults.md.")] = None,
-    resume: Annotated[
-        Path | None, typer.Option(help="Keep each row in this file, and do not fly again what is in it.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="File to write the table to, such as docs/faults.md.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="File of finished rows; these are not flown again.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON and nothing else.")] = False,
 ) -> None:
     """Fly the fault matrix in the lockstep simulator.
 
-    Exit code 0 when every fault ended as the table says, 1 when one did not, 2 on wrong usage.
+    Exit code 0 when every fault ended as expected, 1 when one did not, 2 on wrong usage.
     """
     from morpheyes_daemon.campaigns.runner import parse_seeds
     from morpheyes_daemon.cli.terminal.progress import progress_line

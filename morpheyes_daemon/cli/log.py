@@ -1,4 +1,4 @@
-"""`morpheyes log`: what is in a flight log, its events, and saving one that was cut off."""
+"""`morpheyes log`: content and events of a flight log, and recovery of a truncated one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 if TYPE_CHECKING:
     from morpheyes_daemon.recorder.reader import Flight
 
-app = typer.Typer(help="Look into flight logs and save damaged ones.", no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(help="Inspect flight logs and recover damaged ones.", no_args_is_help=True, rich_markup_mode=None)
 
 LogFile = Annotated[Path, typer.Argument(help="A flight log (.mcap).")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
@@ -19,7 +19,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
 
 @app.command()
 def info(file: LogFile, as_json: AsJson = False) -> None:
-    """Say what flew, for how long, and how much of each topic was recorded."""
+    """Show mission, duration and number of messages per topic of a flight log."""
     from morpheyes_daemon.recorder.reader import read_flight
 
     content = _content(read_flight(file))
@@ -52,13 +52,13 @@ def _page(content: dict[str, Any]) -> str:
     lines = [f"{key:17} {value}" for key, value in shown.items() if value != ""]
     lines += [f"  {count:8d}  {topic}" for topic, count in content["topics"].items()]
     if not content["finished"]:
-        lines.append(f"The log was cut off; `morpheyes log recover {content['file']}` makes a whole one of it.")
+        lines.append(f"The log is truncated; `morpheyes log recover {content['file']}` writes a complete one.")
     return "\n".join(lines)
 
 
 @app.command()
 def events(file: LogFile, as_json: AsJson = False) -> None:
-    """List every event with its reason, seconds since the first message of the log."""
+    """List every event with its time since the first message, source and reason."""
     from morpheyes_daemon.recorder.reader import read_flight
 
     flight = read_flight(file)
@@ -81,10 +81,10 @@ def _more(text: str) -> str:
 @app.command()
 def recover(
     file: LogFile,
-    out: Annotated[Path | None, typer.Option(help="Where to; default FILE.recovered.mcap.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Log to write; default: FILE.recovered.mcap.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Copy everything readable of a log that was cut off into a new one that every tool opens."""
+    """Copy everything readable of a truncated log into a new, complete one."""
     from dataclasses import asdict
 
     from morpheyes_daemon.recorder.reader import recover as copy_readable

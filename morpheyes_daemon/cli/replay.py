@@ -1,4 +1,4 @@
-"""`morpheyes replay`: decide a recorded flight again and compare."""
+"""`morpheyes replay`: runs the strategy on the recorded observations of a flight and compares its commands."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ if TYPE_CHECKING:
     from morpheyes_daemon.recorder.replay import Replay
 
 SHOWN = 10
+"""Differences that are listed; chosen: a screen."""
 
 
 def command(
     file: Annotated[Path, typer.Argument(help="A flight log (.mcap).")],
     mission: Annotated[
-        str | None, typer.Option(help="Another mission, by name or path; none: the one that was flown.")
+        str | None, typer.Option(help="Another mission, by name or path; default: the one that was flown.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Put every recorded observation through the strategy again; exit 1 when a command comes out differently."""
+    """Run the strategy on every recorded observation again; exit code 1 when a command differs."""
     from dataclasses import asdict
 
     from morpheyes_daemon.recorder.replay import replay
@@ -36,7 +37,7 @@ def command(
 def _page(result: Replay) -> str:
     lines = [f"{result.mission}: {result.decisions} decisions replayed, {len(result.differences)} differ"]
     if result.without_percept:
-        lines.append(f"{result.without_percept} decisions left out: their percept is not in the log")
+        lines.append(f"{result.without_percept} decisions left out: their percepts are not in the log")
     for difference in result.differences[:SHOWN]:
         changes = "; ".join(f"{name}: {was} -> {now}" for name, (was, now) in difference.fields.items())
         lines.append(f"{difference.t_s:9.3f} s  {changes}")

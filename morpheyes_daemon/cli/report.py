@@ -1,4 +1,4 @@
-"""`morpheyes report`: figures and pictures of a recorded flight."""
+"""`morpheyes report`: statistics and pictures of a recorded flight."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import typer
 def command(
     file: Annotated[Path, typer.Argument(help="A flight log (.mcap).")],
     out: Annotated[Path | None, typer.Option(help="Folder for the pictures; default: beside FILE.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the statistics as JSON.")] = False,
 ) -> None:
-    """Make map.png, strips.png and flight.mp4 of a flight log and print the flight in figures."""
+    """Draw map.png, strips.png and flight.mp4 of a flight log and print its statistics."""
     from dataclasses import asdict
 
     from morpheyes_daemon.recorder.encoding import to_plain

@@ -10,9 +10,9 @@ import typer
 
 def command(
     folders: Annotated[list[Path], typer.Argument(help="Folders of finished `morpheyes experiment` campaigns.")],
-    out: Annotated[Path, typer.Option(help="Page to write; its other parts are kept.")] = Path("docs/results.md"),
+    out: Annotated[Path, typer.Option(help="Page to write; its other sections are kept.")] = Path("docs/results.md"),
 ) -> None:
-    """Write the missions' part of a results page from campaigns: what the paper says, what came out, why."""
+    """Write the sections of the missions of a results page: the paper's figures, the measured ones, and remarks."""
     from morpheyes_daemon.campaigns.results_page import write_page
 
     typer.echo(write_page(folders, out))

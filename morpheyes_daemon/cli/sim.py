@@ -13,46 +13,51 @@ import typer
 if TYPE_CHECKING:
     from morpheyes_daemon.flights.lockstep import FlightPlan, Summary
 
+Realtime = Annotated[bool, typer.Option("--realtime", help="Fly in real time, over sockets and a pty.")]
+Autopilot = Annotated[
+    str | None, typer.Option(help="A running ArduPilot SITL, such as tcp:127.0.0.1:5760; implies --realtime.")
+]
+Config = Annotated[Path | None, typer.Option(help="Vehicle configuration; default: ./config.yaml or the shipped one.")]
+Calibration = Annotated[
+    str | None,
+    typer.Option(
+        help="'solved' from rendered boards, 'mounted' with the mount measured as well (default for gaps), "
+        "'exact', or a calibration file."
+    ),
+]
+
 
 def command(
     mission: Annotated[str, typer.Argument(help="A shipped mission by name, or a mission file.")] = "forest",
-    seed: Annotated[int, typer.Option(min=0, help="Plants the world and all noise.")] = 0,
-    baseline: Annotated[str, typer.Option(help="'variable', or a length in metres to hold.")] = "variable",
-    realtime: Annotated[
-        bool, typer.Option("--realtime", help="Fly over sockets and a pty, at the clock's pace.")
-    ] = False,
-    autopilot: Annotated[
-        str | None, typer.Option(help="A running ArduPilot SITL, such as tcp:127.0.0.1:5760; implies --realtime.")
-    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the world and of all noise.")] = 0,
+    baseline: Annotated[str, typer.Option(help="'variable', or a fixed baseline in metres.")] = "variable",
+    realtime: Realtime = False,
+    autopilot: Autopilot = None,
     rate_hz: Annotated[float, typer.Option(min=0.2, max=60.0, help="Stereo pairs per second.")] = 5.0,
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "640x480",
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: out/MISSION-SEED.")] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="Vehicle configuration; default: ./config.yaml or the shipped one.")
-    ] = None,
-    calibration: Annotated[
-        str | None,
-        typer.Option(
-            help="'solved' from rendered boards, 'mounted': the eyes' mount measured too (usual for gaps), 'exact', "
-            "or a file."
-        ),
-    ] = None,
+    config: Config = None,
+    calibration: Calibration = None,
     world: Annotated[str | None, typer.Option(help="World by name or path, instead of the mission's own.")] = None,
-    wind_m_s: Annotated[float, typer.Option(min=0.0, max=15.0, help="Mean wind, with its gusts.")] = 2.0,
-    latency_ms: Annotated[float | None, typer.Option(min=0.0, help="Frame to depth in lockstep.")] = None,
-    limit_s: Annotated[float, typer.Option(min=1.0, help="Simulated seconds until the flight counts as lost.")] = 180.0,
+    wind_m_s: Annotated[float, typer.Option(min=0.0, max=15.0, help="Mean wind speed; gusts are added.")] = 2.0,
+    latency_ms: Annotated[
+        float | None, typer.Option(min=0.0, help="Latency from frame to depth in lockstep; default: the configured one.")
+    ] = None,
+    limit_s: Annotated[
+        float, typer.Option(min=1.0, help="Simulated seconds until the flight counts as failed.")
+    ] = 180.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON and nothing else.")] = False,
 ) -> None:
-    """Fly a mission in the simulator with the real daemon, and leave log, map, strips and film in a folder.
+    """Fly a mission in the simulator with the real daemon, and write log, map, strips and film into a folder.
 
-    Exit code 0 when the goal was reached (or a gap rightly refused), 1 when not, 2 on wrong usage.
+    Exit code 0 when the goal was reached (or a too narrow gap refused), 1 when not, 2 on wrong usage.
     """
     from morpheyes_daemon.cli.terminal.extras import require_simulator
     from morpheyes_daemon.cli.terminal.progress import progress_line
     from morpheyes_daemon.errors import UsageError
 
     if autopilot is not None and not re.fullmatch(r"tcp:[^:/]+:\d+", autopilot):
-        raise UsageError(f"--autopilot {autopilot}: write tcp:HOST:PORT, the first port of the SITL, mostly 5760.")
+        raise UsageError(f"--autopilot {autopilot}: write tcp:HOST:PORT with the first port of the SITL, usually 5760.")
     require_simulator()
     from morpheyes_daemon.flights.flight_plan import make_plan
 
@@ -93,7 +98,7 @@ def _fly_lockstep(plan: FlightPlan, folder: Path, quiet: bool) -> Summary:
     with FlightLine(quiet) as line:
         watchers.progress = line.show
         summary = fly(plan, watchers)
-        line.say("drawing the pictures")
+        line.show_step("drawing the pictures")
         outputs.finish(summary)
     return summary
 
@@ -114,7 +119,7 @@ def _page(summary: Summary, folder: Path) -> str:
         *([("why", textwrap.fill(s.text, 90, subsequent_indent=22 * " "))] if s.text else []),
         ("time, path", f"{s.time_s:.1f} s, {s.path_m:.1f} m"),
         ("speed", f"{s.mean_speed_m_s:.2f} m/s mean, {s.peak_speed_m_s:.2f} m/s peak"),
-        ("smallest clearance", f"{1e3 * s.min_clearance_m:.0f} mm (hull and bar to obstacle)"),
+        ("smallest clearance", f"{1e3 * s.min_clearance_m:.0f} mm (from hull and bar to the nearest obstacle)"),
         ("baseline", f"{s.baseline_mode}, {s.baseline_min_m * 1e3:.0f} to {s.baseline_max_m * 1e3:.0f} mm"),
         ("calibration", s.calibration),
         ("vision", f"{s.frames} frames of {s.image_size} at {s.perception_rate_hz:.1f} Hz"),

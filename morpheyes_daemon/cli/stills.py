@@ -1,4 +1,4 @@
-"""`morpheyes stills`: a world path-traced, for figures, beside what the fast renderer makes of it."""
+"""`morpheyes stills`: path-traced stereo pairs of a world, for figures, beside those of the fast renderer."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import typer
 
 def command(
     world: Annotated[str, typer.Argument(help="A world by name or path.")],
-    seed: Annotated[int, typer.Option(help="Plants the world.")] = 0,
-    first_m: Annotated[float, typer.Option(help="Where along the course the first pair is taken.")] = 0.0,
-    steps: Annotated[int, typer.Option(min=1, help="How many pairs.")] = 1,
-    step_m: Annotated[float, typer.Option(help="Way between them.")] = 1.0,
-    height_m: Annotated[float, typer.Option(min=0.1, help="Of the cameras above ground.")] = 1.5,
-    yaw_deg: Annotated[float, typer.Option(help="Where the cameras look, 0: along the course.")] = 0.0,
-    baseline: Annotated[float, typer.Option(min=0.01, max=1.0, help="Metres between the eyes.")] = 0.2,
+    seed: Annotated[int, typer.Option(help="Seed of the world.")] = 0,
+    first_m: Annotated[float, typer.Option(help="Position of the first pair along the course, metres.")] = 0.0,
+    steps: Annotated[int, typer.Option(min=1, help="Number of pairs.")] = 1,
+    step_m: Annotated[float, typer.Option(help="Distance between pairs, metres.")] = 1.0,
+    height_m: Annotated[float, typer.Option(min=0.1, help="Height of the cameras above ground, metres.")] = 1.5,
+    yaw_deg: Annotated[float, typer.Option(help="Viewing direction, 0: along the course.")] = 0.0,
+    baseline: Annotated[float, typer.Option(min=0.01, max=1.0, help="Baseline, metres.")] = 0.2,
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "640x480",
-    samples: Annotated[int, typer.Option(min=1, max=4096, help="Paths per pixel; 32 take minutes a picture.")] = 32,
+    samples: Annotated[int, typer.Option(min=1, max=4096, help="Paths per pixel; 32 take minutes per picture.")] = 32,
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out/stills"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the comparison as JSON and nothing else.")] = False,
 ) -> None:
@@ -43,6 +43,6 @@ def command(
         typer.echo(
             f"{row['step']:>4}  depth on {row['fast_valid']:.0%} fast, {row['traced_valid']:.0%} traced; "
             f"error {row['fast_error_px']:.2f} px, {row['traced_error_px']:.2f} px; "
-            f"apart by {row['difference_px']:.2f} px"
+            f"difference {row['difference_px']:.2f} px"
         )
     typer.echo(f"{out}/000_compared.png")

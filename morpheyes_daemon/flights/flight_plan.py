@@ -6,13 +6,13 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.config.packaged import load_config
 from morpheyes_daemon.config.vehicle import VehicleConfig
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.flights.lockstep import FlightPlan, sim_config
 from morpheyes_daemon.flights.sim_vehicle import Scenario
 from morpheyes_daemon.perception.craft import fitting_rig
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.simulation.worlds.loader import load_world
 from morpheyes_daemon.stereo.calibration_file import write_calibration
 from morpheyes_daemon.strategies.missions import find_mission, load_mission

@@ -19,10 +19,11 @@ import yaml
 from morpheyes_daemon.calibration.mount import ATTITUDES, COLUMNS, MOUNT_VIEWS, MountViews, board_rotation
 from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners
 from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
-from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.config.vehicle import ServoMotion
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import RawPair
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.simulation.autopilot.ekf import EstimatorNoise
 from morpheyes_daemon.simulation.camera.calibration_boards import BoardTwin
 from morpheyes_daemon.simulation.camera.true_rig import RANGE_M, RigTwin

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from morpheyes_daemon.calibration.mount import solve_mount, ways_up
+from morpheyes_daemon.calibration.mount import orientations, solve_mount
 from morpheyes_daemon.calibration.solver.result import rig_model
 from morpheyes_daemon.calibration.solver.solver import calibrate
-from morpheyes_daemon.calibration.targets.observations import Progress, silent
 from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount
 from morpheyes_daemon.errors import CalibrationError
 from morpheyes_daemon.flights.sim_boards import DEFAULT_BOARD, observe_mount, observe_twin, twin_name
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.simulation.rendering.texture_cache import cache_folder
 from morpheyes_daemon.stereo.calibration_file import read_calibration, write_calibration
 from morpheyes_daemon.stereo.rig import RigModel
@@ -41,7 +41,9 @@ def mounted_rig_file(seed: int, cache_dir: Path | None = None, progress: Progres
     path = solved.with_name(f"{solved.stem}-mounted-v{_MOUNT_METHOD}.yaml")
     if not _readable(path):
         rig = read_calibration(solved)
-        found = solve_mount(observe_mount(seed, rig.cam0, progress), T_frd_rig(Mount())[:3, :3], ways_up(DEFAULT_BOARD))
+        found = solve_mount(
+            observe_mount(seed, rig.cam0, progress), T_frd_rig(Mount())[:3, :3], orientations(DEFAULT_BOARD)
+        )
         write_calibration(replace(rig, mount=found.mount), path)
     return path
 

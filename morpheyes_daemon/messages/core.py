@@ -31,6 +31,9 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
 KNOWN_SHARE = 0.05
 """Share of a baseline that its sigma may be: beyond it depth has no scale, and rows mean nothing."""
 
+SECTORS = 72
+"""Directions of `Perception.sectors_m`: the length of the array in MAVLink's OBSTACLE_DISTANCE."""
+
 
 @dataclass(frozen=True, slots=True)
 class BaselineEstimate:
@@ -137,7 +140,7 @@ class DepthSummary:
 class Perception:
     """What the vision worker returns for one frame.
 
-    `percept` is the strategy's own (picklable) finding. `sectors_m` (72,) float32 nearest obstacle per sector of
+    `percept` is the strategy's own (picklable) finding. `sectors_m` (SECTORS,) float32 nearest obstacle per sector of
     the horizontal field of view, left to right, NaN free or unknown, for OBSTACLE_DISTANCE.
     `left_rect` and `depth_m` are small views for recorder and dashboard, or None when not asked for. `events` is what
     the watch over the calibration has to tell.

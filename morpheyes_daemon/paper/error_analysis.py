@@ -16,7 +16,7 @@ from morpheyes_daemon.theory.calibration_error import (
     EXTRINSIC,
     FOCAL_LENGTHS_MM,
     SWEPT,
-    EyePair,
+    CameraPair,
     extrinsic_error,
     intrinsic_error,
     nominal,
@@ -50,7 +50,7 @@ class Subject:
 
     name: str
     lenses: Mapping[str, CameraIntrinsics]
-    pairs: Mapping[str, EyePair]
+    pairs: Mapping[str, CameraPair]
     f_px: float
     width_px: int
     baselines_m: tuple[float, ...]

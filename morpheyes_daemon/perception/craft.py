@@ -1,12 +1,10 @@
-"""The calibrated rig, the craft and the strategy as one vehicle configuration gives them."""
+"""Builds the calibrated rig, the craft and the strategy of one vehicle configuration."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
-import numpy as np
-
+from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.config.yaml_errors import validate
 from morpheyes_daemon.errors import CalibrationError
@@ -14,13 +12,13 @@ from morpheyes_daemon.stereo.calibration_file import read_calibration
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import Craft, Strategy
 from morpheyes_daemon.strategies.registry import find_strategy
-from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rpy, pose
 
 
 def fitting_rig(calibration: Path, config: VehicleConfig) -> RigModel:
     """Return the rig of a calibration file.
 
-    Raises CalibrationError when it is another camera's, or lacks baselines that the vehicle may be asked for.
+    Raises CalibrationError when the file cannot be read, its images have another aspect ratio, or its calibrated
+    range does not cover the configured baselines.
     """
     rig = read_calibration(calibration)
     try:
@@ -33,13 +31,10 @@ def fitting_rig(calibration: Path, config: VehicleConfig) -> RigModel:
 
 
 def build_craft(config: VehicleConfig) -> Craft:
-    """Return what strategies may know of the vehicle."""
-    mount = config.camera.mount
-    tilt = R_from_rpy(0.0, math.radians(mount.tilt_up_deg), 0.0)
-    position = np.array([mount.forward_mm, mount.right_mm, mount.down_mm]) / 1e3
+    """Return the properties of the vehicle that strategies use."""
     return Craft(
         footprint=config.footprint,
-        T_frd_rig=pose(tilt @ R_FRD_CAM, position),
+        T_frd_rig=T_frd_rig(config.camera.mount),
         baseline_range_m=config.baseline_range_m,
         frame_period_s=1.0 / config.camera.rate_hz,
         depth_sigmas=config.safety.depth_sigmas,
@@ -48,7 +43,7 @@ def build_craft(config: VehicleConfig) -> Craft:
 
 
 def build_strategy(mission: MissionFile, config: VehicleConfig) -> Strategy:
-    """Return the mission's strategy with its checked parameters; raises ConfigError."""
+    """Return the mission's strategy; raises ConfigError when it does not exist or its parameters are invalid."""
     kind = find_strategy(mission.strategy)
     parameters = validate(mission.parameters, kind.Parameters, "parameters", None)
     return kind(parameters, build_craft(config))

@@ -1,9 +1,9 @@
-"""Whether depth is to scale: the vehicle's own motion makes near points move in the image faster than far ones.
+"""Monitor of the depth scale: compares stereo depth with structure from motion of the left camera.
 
-A servo that sticks while its targets are acknowledged leaves a pair whose rows align and whose depths are all wrong
-by the same factor, modelled over true baseline. How far a point moves from one left image to the next depends on its
-true depth and on the way flown, which the autopilot knows; the right eye takes no part in it. Only a vehicle that
-flies tells anything, and nothing is corrected here.
+A servo that sticks while it acknowledges its targets leaves rectified rows aligned and scales every depth by the
+modelled over the true baseline. The displacement of a point between two left images depends on its true depth and on
+the vehicle's translation, which the autopilot reports; the right camera is not involved. A hovering vehicle gives no
+measurement. Nothing is corrected here.
 """
 
 from __future__ import annotations
@@ -17,35 +17,53 @@ import numpy as np
 
 from morpheyes_daemon.messages.core import DepthMap, Image, Pinhole
 from morpheyes_daemon.perception.camera_motion import CameraMotion
-from morpheyes_daemon.stereo.lucas_kanade import follow
+from morpheyes_daemon.stereo.lucas_kanade import LucasKanade
 from morpheyes_daemon.transforms import Array, R_from_rotvec
 
-_POINTS, _SPACING_PX, _WINDOW_PX = 160, 8, 15
+_POINTS, _SPACING_PX, _CORNER_QUALITY = 160, 8, 0.01
+"""Corners per frame, their least distance in pixels, and least response relative to the strongest (OpenCV's
+goodFeaturesToTrack); chosen: more corners cost time."""
+_TRACKER = LucasKanade(window_px=15, levels=3, return_px=0.5)
+"""From frame to frame; chosen: larger windows blur depth edges, a looser return check admits false matches."""
 _FEWEST_POINTS = 30
-_FARTHEST_ERROR = 0.1
-"""Points whose depth is uncertain by more than this share say little."""
-_RETURN_PX = 0.5
-"""How near the way back from the second image must end."""
+"""Points that a fit of four unknowns needs; chosen: with fewer a single moving object can dominate."""
+_MAX_RELATIVE_DEPTH_ERROR = 0.1
+"""Relative sigma of depth up to which a point is used; chosen: farther points add little to the scale."""
 _SPEED_SIGMA_M_S = 0.1
-"""How well the autopilot knows the vehicle's velocity."""
-_TURN_SIGMA_RAD, _SEEN_SIGMA_RAD = 0.02, 1e-3
-"""How well it knows the turn from one image to the next, and how well a point is found again."""
+"""One sigma of the reported velocity, m/s; chosen: that of the simulated autopilot (benchmarks.online_calibration)."""
+_TURN_SIGMA_RAD, _TRACKING_SIGMA_RAD = 0.02, 1e-3
+"""One sigma of the reported rotation between two frames, and of a tracked direction, rad; chosen: their ratio is the
+weight of the reported rotation against the images."""
 _LONGEST_S = 1.0
+"""Longest time between two compared frames, seconds; chosen: the mean of two velocities is no translation beyond."""
+_MIN_DEPTH_M = 0.1
+"""Least depth in the second frame, metres; chosen: nearer than any near limit."""
+_ROUNDS = 6
+"""Gauss-Newton steps with outlier rejection; chosen: more cost time."""
+_FACTOR_RANGE = (0.05, 20.0)
+"""Scale factors beyond which the fit has diverged; chosen: the rig's baselines differ by a factor of 3."""
+_OUTLIER_FACTOR, _OUTLIER_FLOOR_PX, _NOISE_FLOOR_PX = 3.0, 0.5, 0.2
+"""Outlier limit in medians of the residual and its floor, and floor of the noise, pixels; chosen: tighter limits
+reject points of a rotated view."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScaleLimits:
-    """When depth counts as out of scale: the factor, the sigma that a frame may have, and the share of such frames."""
+    """M-of-N confirmation of a wrong depth scale; chosen: smaller limits alarm sooner and falsely more often."""
 
     factor: float = 1.3
+    """Factor, or its inverse, beyond which a frame counts as wrong, with two sigmas on top."""
     sigma: float = 0.1
+    """Largest relative sigma of a frame that counts."""
     frames: int = 4
+    """M: wrong frames that raise the alarm."""
     of: int = 5
+    """N: counted frames."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScaleFit:
-    """`factor`: measured depth over true depth, one sigma of it relative; `count` points agree."""
+    """`factor`: stereo depth over true depth, with its relative sigma; `count` inliers."""
 
     factor: float
     sigma: float
@@ -53,8 +71,8 @@ class ScaleFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
-    """What one frame shows: the rectified left grey image (H, W), its depth, and how the eye moves."""
+class ScaleObservation:
+    """One frame: the rectified left grey image (H, W) uint8, its depth map, and the motion of the left camera."""
 
     left: Image
     depth: DepthMap
@@ -62,98 +80,95 @@ class Sight:
 
 
 class DepthScaleMonitor:
-    """Fed with every frame; True once most of the latest telling frames agree that depth is out of scale."""
+    """Compares every frame with the one before it and confirms a wrong scale by M of N frames."""
 
     def __init__(self, limits: ScaleLimits | None = None) -> None:
         self._limits = limits or ScaleLimits()
-        self._last: Sight | None = None
+        self._last: ScaleObservation | None = None
         self._wrong: deque[bool] = deque(maxlen=self._limits.of)
 
-    def check(self, sight: Sight) -> bool:
-        """Take a frame; returns whether depth is out of scale, by it and the frames before."""
-        last, self._last = self._last, sight
-        fit = scale_between(last, sight) if last is not None else None
+    def check(self, observation: ScaleObservation) -> bool:
+        """Add a frame; return whether the depth scale is confirmed as wrong."""
+        last, self._last = self._last, observation
+        fit = scale_between(last, observation) if last is not None else None
         if fit is not None and fit.sigma <= self._limits.sigma:
             self._wrong.append(abs(math.log(fit.factor)) > math.log(self._limits.factor) + 2.0 * fit.sigma)
         return sum(self._wrong) >= self._limits.frames
 
 
-def scale_between(first: Sight, second: Sight) -> ScaleFit | None:
-    """Return by what factor the depth of `first` is too large; None when the two frames tell nothing."""
-    seconds = (second.depth.t_ns - first.depth.t_ns) * 1e-9
-    if not 0.0 < seconds <= _LONGEST_S:
+def scale_between(first: ScaleObservation, second: ScaleObservation) -> ScaleFit | None:
+    """Return the factor by which the depth of `first` is too large; None when the frames give no measurement.
+
+    Robust Gauss-Newton for the factor and a small rotation, with the reported rotation as prior.
+    """
+    dt_s = (second.depth.t_ns - first.depth.t_ns) * 1e-9
+    if not 0.0 < dt_s <= _LONGEST_S:
         return None
-    flown = _flown(first.motion, second.motion, seconds)
-    uv = _telling_points(first)
+    translation = _translation(first.motion, second.motion, dt_s)
+    uv = _informative_points(first)
     if len(uv) < _FEWEST_POINTS:
         return None
     places = _rays(uv, first.depth.pinhole) * first.depth.depth_m[uv[:, 1], uv[:, 0]].astype(np.float64)[:, None]
     R_2_1 = second.motion.T_ned_rect[:3, :3].T @ first.motion.T_ned_rect[:3, :3]
-    turned = places @ R_2_1.T
-    seen, good = follow(
-        first.left,
-        second.left,
-        uv,
-        _pixels(turned - flown, second.depth.pinhole),
-        window_px=_WINDOW_PX,
-        levels=3,
-        return_px=_RETURN_PX,
-    )
+    rotated = places @ R_2_1.T
+    guess = _pixels(rotated - translation, second.depth.pinhole)
+    seen, good = _TRACKER.track(first.left, second.left, uv, guess)
     if good.sum() < _FEWEST_POINTS:
         return None
     rays = _rays(seen[good], second.depth.pinhole)[:, :2]
-    return _fit(turned[good], flown, rays, second.depth.pinhole.f_px, _SPEED_SIGMA_M_S * seconds)
+    return _fit(rotated[good], translation, rays, second.depth.pinhole.f_px, _SPEED_SIGMA_M_S * dt_s)
 
 
-def _flown(first: CameraMotion, second: CameraMotion, seconds: float) -> Array:
-    """Return the way (3,) of the eye from frame to frame, in the second frame's axes."""
+def _translation(first: CameraMotion, second: CameraMotion, dt_s: float) -> Array:
+    """Return the translation (3,) m of the left camera between two frames, in rect axes of the second one."""
     v_ned = first.T_ned_rect[:3, :3] @ first.v_rect_m_s + second.T_ned_rect[:3, :3] @ second.v_rect_m_s
-    return np.asarray(second.T_ned_rect[:3, :3].T @ v_ned * (seconds / 2.0))
+    return np.asarray(second.T_ned_rect[:3, :3].T @ v_ned * (dt_s / 2.0))
 
 
-def _telling_points(sight: Sight) -> Array:
-    """Return (n, 2) well-textured pixels whose depth is known well enough."""
-    depth = sight.depth
-    limit_m = _FARTHEST_ERROR * depth.baseline_m * depth.pinhole.f_px / depth.sigma_disparity_px
+def _informative_points(observation: ScaleObservation) -> Array:
+    """Return (n, 2) corners whose depth is known within `_MAX_RELATIVE_DEPTH_ERROR`: Z < share b f / sigma_d."""
+    depth = observation.depth
+    limit_m = _MAX_RELATIVE_DEPTH_ERROR * depth.baseline_m * depth.pinhole.f_px / depth.sigma_disparity_px
     mask = (depth.depth_m < limit_m).astype(np.uint8)
-    corners = cv2.goodFeaturesToTrack(sight.left, _POINTS, 0.01, _SPACING_PX, mask=mask)
+    corners = cv2.goodFeaturesToTrack(observation.left, _POINTS, _CORNER_QUALITY, _SPACING_PX, mask=mask)
     return np.empty((0, 2), np.int64) if corners is None else np.rint(corners.reshape(-1, 2)).astype(np.int64)
 
 
-def _fit(turned: Array, flown: Array, rays: Array, f_px: float, flown_sigma_m: float) -> ScaleFit | None:
-    """Solve for the factor k and a small turn w by least squares on ever fewer points.
+def _fit(rotated: Array, translation: Array, rays: Array, f_px: float, translation_sigma_m: float) -> ScaleFit | None:
+    """Solve for the factor k and a small rotation w.
 
-    A point at true depth Z/k is seen at turned/k - flown, in the same direction as turned - k flown.
+    A point (n, 3) at true depth Z / k lies at rotated / k - translation in the second frame, in the same direction as
+    rotated - k translation; `rays` (n, 2) are the measured directions.
     """
-    k, w, believed = 1.0, np.zeros(3), (_SEEN_SIGMA_RAD / _TURN_SIGMA_RAD) ** 2
-    kept = np.ones(len(turned), dtype=np.bool_)
-    for _ in range(6):
-        points = turned @ R_from_rotvec(w).T - k * flown
-        kept &= points[:, 2] > 0.1
+    k, w, prior = 1.0, np.zeros(3), (_TRACKING_SIGMA_RAD / _TURN_SIGMA_RAD) ** 2
+    kept = np.ones(len(rotated), dtype=np.bool_)
+    for _ in range(_ROUNDS):
+        points = rotated @ R_from_rotvec(w).T - k * translation
+        kept &= points[:, 2] > _MIN_DEPTH_M
         if kept.sum() < _FEWEST_POINTS:
             return None
-        off = rays - points[:, :2] / points[:, 2:]
-        by_k, by_w = _derivatives(points, flown)
+        residual = rays - points[:, :2] / points[:, 2:]
+        by_k, by_w = _derivatives(points, translation)
         columns = np.concatenate([by_k[:, :, None], by_w], axis=2)[kept].reshape(-1, 4)
-        normal = columns.T @ columns + np.diag([0.0, believed, believed, believed])
-        moment = columns.T @ off[kept].reshape(-1) - np.array([0.0, *(believed * w)])
+        normal = columns.T @ columns + np.diag([0.0, prior, prior, prior])
+        moment = columns.T @ residual[kept].reshape(-1) - np.array([0.0, *(prior * w)])
         try:
             step = np.linalg.solve(normal, moment)
         except np.linalg.LinAlgError:
             return None
         k, w = k + float(step[0]), w + step[1:]
-        size = np.abs(off).max(axis=1)
-        kept = size <= max(0.5 / f_px, 3.0 * float(np.median(size)))
-        if not 0.05 < k < 20.0:
+        size = np.abs(residual).max(axis=1)
+        kept = size <= max(_OUTLIER_FLOOR_PX / f_px, _OUTLIER_FACTOR * float(np.median(size)))
+        if not _FACTOR_RANGE[0] < k < _FACTOR_RANGE[1]:
             return None
-    noise = max(0.2 / f_px, 1.4826 * float(np.median(np.abs(off[kept]))))
+    noise = max(_NOISE_FLOOR_PX / f_px, 1.4826 * float(np.median(np.abs(residual[kept]))))
     variance = noise**2 * float(np.linalg.inv(normal)[0, 0])
-    sigma = math.hypot(math.sqrt(variance) / k, flown_sigma_m / max(float(np.linalg.norm(flown)), 1e-9))
+    sigma = math.hypot(math.sqrt(variance) / k, translation_sigma_m / max(float(np.linalg.norm(translation)), 1e-9))
     return ScaleFit(k, sigma, int(kept.sum()))
 
 
-def _derivatives(points: Array, flown: Array) -> tuple[Array, Array]:
-    """Return how the directions (n, 2) of points move with the factor (n, 2) and with a small turn (n, 2, 3)."""
+def _derivatives(points: Array, translation: Array) -> tuple[Array, Array]:
+    """Return the derivatives of the directions of points (n, 3) by factor (n, 2) and by small rotation (n, 2, 3)."""
     x, y, z = points.T
     zero, one = np.zeros_like(z), 1.0 / z
     direction = np.stack([np.stack([one, zero, -x / z**2], axis=1), np.stack([zero, one, -y / z**2], axis=1)], axis=1)
@@ -165,7 +180,7 @@ def _derivatives(points: Array, flown: Array) -> tuple[Array, Array]:
         ],
         axis=1,
     )
-    return direction @ -flown, direction @ turning
+    return direction @ -translation, direction @ turning
 
 
 def _rays(uv: Array, pinhole: Pinhole) -> Array:
@@ -175,6 +190,6 @@ def _rays(uv: Array, pinhole: Pinhole) -> Array:
 
 
 def _pixels(places: Array, pinhole: Pinhole) -> Array:
-    z = np.maximum(places[:, 2], 0.1)
+    z = np.maximum(places[:, 2], _MIN_DEPTH_M)
     u = pinhole.f_px * places[:, 0] / z + pinhole.cx_px
     return np.stack([u, pinhole.f_px * places[:, 1] / z + pinhole.cy_px], axis=1)

@@ -1,10 +1,10 @@
-"""Watching the calibration in flight: has an eye turned, and by how much; corrected when the evidence is strong.
+"""Extrinsics monitor: estimates in flight how far the right camera has rotated, and corrects the rig.
 
-Pitch and roll between the eyes show in the rows of every textured frame (stereo.epipolar), the time between the eyes
-in how rows follow the motion, the yaw only where the same static scene is seen at two baselines (`yaw_watch`). Each
-is acted upon only when it is many sigmas clear of zero and confirmed over several frames; scenes without texture,
-frames with the servo moving and scenes that move themselves count for nothing. The rig that was loaded is never
-changed: `rig` is a turned copy, and every correction is told as a finding.
+Pitch and roll between the cameras appear in the rows of every textured frame, the time offset between the exposures
+in row rates that follow the motion (both `stereo.epipolar`), the yaw only where one static scene is seen at two
+baselines (`yaw_estimator`). Each is acted upon only when it is many sigmas from zero and confirmed over several
+frames; frames without texture, with a moving servo, or of a moving scene do not count. The loaded rig is never
+changed: `rig` is a corrected copy, and every correction is reported as a finding.
 """
 
 from __future__ import annotations
@@ -17,70 +17,82 @@ import numpy as np
 
 from morpheyes_daemon.messages.core import KNOWN_SHARE, BaselineEstimate, DepthMap
 from morpheyes_daemon.perception.camera_motion import CameraMotion, row_rates
-from morpheyes_daemon.perception.yaw_estimator import Look, Uncertain, YawEstimator
+from morpheyes_daemon.perception.yaw_estimator import MotionUncertainty, YawEstimator, YawObservation
 from morpheyes_daemon.stereo.depth import RectifiedPair, disparity_of
-from morpheyes_daemon.stereo.epipolar import SHARP_S, RowFit, RowOffsets, RowWatch, levelled
+from morpheyes_daemon.stereo.epipolar import (
+    TIME_OFFSET_SIGMA_S,
+    RowFit,
+    RowOffsetEstimator,
+    RowOffsets,
+    without_rotation,
+)
 from morpheyes_daemon.stereo.rectify import rectifying_rotation
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
 
-_LATE_MODEL = 0.05
-"""Share by which the measured time offset may be wrong for want of an exact motion."""
+_TIME_OFFSET_MODEL_ERROR = 0.05
+"""Relative error of the measured time offset by the error of the reported velocity, one sigma; chosen: 0.1 m/s of
+the simulated autopilot at 2 m/s."""
 _MEMORY = 0.95
-"""How much of the rows' evidence is left one frame later: twenty frames count."""
+"""Weight of the evidence of the rows one frame later; chosen: 1 / (1 - 0.95) = 20 frames count, more react later."""
+_UNCERTAINTY_SIGMAS = 2.0
+"""Sigmas of the baseline within which its rows are predicted; chosen: 95 % of a Gaussian."""
+_EDGE = 0.4
+"""Normalised image coordinate at the edge of the view (47 degrees wide: tan 23.5 deg = 0.43), and disparity of near
+objects over f; chosen: it turns a roll, or a slope of the baseline, into a row offset."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExtrinsicsLimits:
-    """What counts as drift, and what evidence it takes."""
+    """Limits of drift and the evidence required; chosen: smaller ones correct sooner and more often wrongly."""
 
     rows_px: float = 0.4
-    """Row error that a turn must cause before it is corrected."""
+    """Row offset that a rotation must cause before it is corrected."""
     yaw_px: float = 0.25
     """Disparity bias that a yaw must cause before it is corrected."""
     yaw_sigma_px: float = 0.15
-    """One sigma of the disparity bias from which half of `strong_sigmas` will do."""
+    """One sigma of the disparity bias below which half of `strong_sigmas` suffices."""
     strong_sigmas: float = 6.0
+    """Distance from zero in sigmas at which evidence is strong."""
     frames: int = 3
-    """Frames in a row that must agree ..."""
+    """Consecutive frames that must agree."""
     unsharp_frames: int = 10
-    """... and so many before a correction while the lateness is not measured: a manoeuvre then looks like a turn."""
+    """The same while the time offset is not measured: a manoeuvre then looks like a rotation."""
     points: int = 80
-    """Points that a frame must have to count at all."""
+    """Least number of points of a frame that counts."""
     small_rad: float = math.radians(0.2)
-    """A turn up to this is watched and corrected before it is held against the frame."""
+    """Rotation up to which the row offsets are compensated before the image checks see them."""
     largest_rad: float = math.radians(0.25)
-    """A turn beyond this, all in all, is no drift: something broke, or it is the calibration of another rig."""
-    late_s: float = 2e-3
-    """Time offset between the eyes that was declared."""
-    late_change_s: float = 1e-3
-    """How far the measured offset may be from it."""
-    late_largest_s: float = 4e-3
-    """An offset farther than this from the declared one makes depth worth nothing; it is measured to half a
-    millisecond."""
+    """Total rotation beyond which the rig counts as broken or the calibration as that of another rig."""
+    time_offset_s: float = 2e-3
+    """Declared time offset between the exposures (camera.sync_error_ms of the configuration)."""
+    time_offset_change_s: float = 1e-3
+    """Largest difference of the measured from the declared time offset that is not reported."""
+    time_offset_largest_s: float = 4e-3
+    """Difference from the declared time offset beyond which depth must not be used; it is measured to 0.5 ms."""
     yaw_pairs: int = 2
-    """Pairs of frames, each of other seconds, that must agree before a yaw is called too large to be a drift."""
+    """Independent pairs of frames that must agree before a large yaw marks the rig as broken."""
     steady_s: float = 0.5
-    """Frames farther apart say nothing of the yaw: too much happens in between."""
+    """Longest time between successive frames for the yaw to be estimated."""
     watch_yaw: bool = True
-    """A yaw is told from how disparities change with the baseline and on the way: not where much of the scene moves."""
+    """Whether the yaw is estimated; False where much of the scene moves."""
 
 
 class ExtrinsicsFault(StrEnum):
-    """What a finding is about."""
+    """Subject of a finding."""
 
     ROWS = "rows"
     UNEXPLAINED = "unexplained"
     TURNED = "turned"
     YAW = "yaw"
-    LATE = "late"
-    DOUBTED = "doubted"
+    TIME_OFFSET = "time_offset"
+    UNCONFIRMED = "unconfirmed"
     BROKEN = "broken"
 
 
 @dataclass(frozen=True, slots=True)
 class ExtrinsicsFinding:
-    """One thing noticed; `corrected` when the rig was turned for it."""
+    """One finding; `corrected` when the rig was corrected by it, `text` for the log."""
 
     what: ExtrinsicsFault
     corrected: bool
@@ -89,10 +101,10 @@ class ExtrinsicsFinding:
 
 @dataclass(frozen=True, slots=True)
 class ExtrinsicsReport:
-    """What one frame added. Angles are of the right eye, from where `rig` has it; sigmas inf when unknown.
+    """Estimates after one frame. Angles (rad) are those of the right camera relative to `rig`; sigmas inf when unknown.
 
-    `rows_px` is the median row difference of this frame (NaN without points), `late_s` by how much the right eye
-    exposes after the left one.
+    `rows_px` is the median row offset of this frame (NaN without points), `time_offset_s` the mid-exposure of the
+    right camera minus that of the left one.
     """
 
     rows_px: float
@@ -103,168 +115,171 @@ class ExtrinsicsReport:
     roll_sigma_rad: float
     yaw_rad: float
     yaw_sigma_rad: float
-    late_s: float
-    late_sigma_s: float
+    time_offset_s: float
+    time_offset_sigma_s: float
     findings: tuple[ExtrinsicsFinding, ...]
 
     @property
     def rig_changed(self) -> bool:
-        """The monitor's rig was turned: rectify by it from now on."""
+        """Whether the monitor's rig was corrected: the next frame must be rectified by it."""
         return any(finding.corrected for finding in self.findings)
 
 
 class ExtrinsicsMonitor:
-    """Fed with every depth map; `rig` is the calibration as corrected so far, to rectify the next frame by."""
+    """Estimates rotations of the right camera from every frame; `rig` is the corrected calibration."""
 
     def __init__(
-        self, rig: RigModel, limits: ExtrinsicsLimits | None = None, uncertain: Uncertain | None = None
+        self, rig: RigModel, limits: ExtrinsicsLimits | None = None, uncertainty: MotionUncertainty | None = None
     ) -> None:
         self.rig = rig
         self.limits = limits or ExtrinsicsLimits()
-        self._uncertain = uncertain
+        self._motion_uncertainty = uncertainty
         self._turned: Array = np.eye(3)
-        self._told: set[ExtrinsicsFault] = set()
+        self._reported: set[ExtrinsicsFault] = set()
         self._fit: RowFit | None = None
-        self._agreeing = self._late_frames = 0
+        self._agreeing = self._out_of_sync_frames = 0
         self._last_ns = 0
         self.broken = False
-        """An eye has turned farther than any drift: depth is worth nothing until a new calibration."""
-        self._rows, self._yaw = RowWatch(_MEMORY, self.limits.late_s), YawEstimator(uncertain)
+        """The right camera has rotated farther than any drift: depth must not be used until a new calibration."""
+        self._rows, self._yaw = RowOffsetEstimator(_MEMORY, self.limits.time_offset_s), YawEstimator(uncertainty)
 
     def update(
         self, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, moving: bool, motion: CameraMotion
     ) -> ExtrinsicsReport:
-        """Look at one pair rectified by `rig`, its depth map and row offsets, and the eye's motion.
+        """Add one frame: the pair rectified by `rig`, its depth map and row offsets, and the motion of the left camera.
 
-        Nothing is corrected while the servo moves, and a frame whose baseline is hardly known does not count.
+        Nothing is corrected while the servo moves (`moving`); a frame whose baseline is not known does not count.
         """
-        if offsets.count < self.limits.points or not self.knows(depth):
+        if offsets.count < self.limits.points or not self.baseline_known(depth):
             self._agreeing = 0
             return self._report(offsets.median_px, offsets.count, self._fit, ())
         f_px, nominal_m = depth.pinhole.f_px, pair.rectification.nominal_m
         rates = row_rates(offsets.uv, offsets.d_px, depth.pinhole, depth.baseline_m, motion)
         self._fit = self._rows.add(offsets, depth.pinhole, *rates)
-        self._late_frames = self._late_frames + 1 if self._is_late(self._fit) else 0
-        findings = [] if moving else self._judge_rows(offsets.median_px, f_px, nominal_m)
+        self._out_of_sync_frames = self._out_of_sync_frames + 1 if self._time_offset_is_excessive(self._fit) else 0
+        findings = [] if moving else self._check_rows(offsets.median_px, f_px, nominal_m)
         steady = depth.t_ns - self._last_ns <= self.limits.steady_s * 1e9
         self._last_ns = depth.t_ns
         if self.limits.watch_yaw and steady and not findings and offsets.median_px < 2 * self.limits.rows_px:
             seen = (disparity_of(depth), depth.baseline_m, depth.baseline_sigma_m, depth.pinhole, motion)
-            self._yaw.add(Look(depth.t_ns, pair.left, pair.right, *seen, *self._late))
-            findings += self._judge_yaw(f_px, nominal_m)
-        findings += self._judge_late()
+            self._yaw.add(YawObservation(depth.t_ns, pair.left, pair.right, *seen, *self._time_offset))
+            findings += self._check_yaw(f_px, nominal_m)
+        findings += self._check_time_offset()
         report = self._report(offsets.median_px, offsets.count, self._fit, tuple(findings))
         if report.rig_changed:
-            self._forget()
+            self._reset()
         return report
 
     @property
-    def late(self) -> bool:
-        """The eyes expose so far from when they should that depth is worth nothing, frame after frame."""
-        return self._late_frames >= self.limits.frames
+    def out_of_sync(self) -> bool:
+        """Whether the time offset is confirmed as so far from the declared one that depth must not be used."""
+        return self._out_of_sync_frames >= self.limits.frames
 
-    def knows(self, depth: DepthMap) -> bool:
-        """Return whether the baseline of a frame is known well enough for its rows to mean anything."""
+    def baseline_known(self, depth: DepthMap) -> bool:
+        """Return whether the sigma of the baseline is below KNOWN_SHARE of it, so that rows can be interpreted."""
         return depth.baseline_sigma_m < KNOWN_SHARE * depth.baseline_m
 
-    def doubt_rad(self, baseline: BaselineEstimate) -> float:
-        """Return by what angle rows may be apart since the baseline may be two sigmas off."""
-        off_m = 2.0 * baseline.sigma_m
+    def row_uncertainty_rad(self, baseline: BaselineEstimate) -> float:
+        """Return the largest row offset, rad, that an error of the baseline of two sigmas causes."""
+        off_m = _UNCERTAINTY_SIGMAS * baseline.sigma_m
         places = np.clip([baseline.baseline_m - off_m, baseline.baseline_m + off_m], *self.rig.range_m)
-        return max(rows_apart_rad(self.rig, baseline.baseline_m, float(place_m)) for place_m in places)
+        return max(row_mismatch_rad(self.rig, baseline.baseline_m, float(place_m)) for place_m in places)
 
-    def unexplained(self, offsets: RowOffsets, depth: DepthMap) -> RowOffsets:
-        """Return row offsets less those of a small turn that is being watched."""
+    def compensated(self, offsets: RowOffsets, depth: DepthMap) -> RowOffsets:
+        """Return row offsets minus those of the estimated rotation, as long as it is small."""
         fit = self._fit
         if fit is None or max(abs(fit.pitch_rad), abs(fit.roll_rad)) > self.limits.small_rad:
             return offsets
-        return levelled(offsets, depth.pinhole, fit)
+        return without_rotation(offsets, depth.pinhole, fit)
 
     @property
-    def _late(self) -> tuple[float, float]:
-        """The time offset and its sigma: as measured when that is sharp, as declared otherwise."""
+    def _time_offset(self) -> tuple[float, float]:
+        """Time offset and its sigma, s: the measured one when it is known well, else the declared one."""
         fit, limits = self._fit, self.limits
-        if fit is None or fit.late_sigma_s > 0.25 * limits.late_change_s:
-            return limits.late_s, limits.late_change_s
-        return fit.late_s, math.hypot(fit.late_sigma_s, _LATE_MODEL * fit.late_s)
+        if fit is None or fit.time_offset_sigma_s > 0.25 * limits.time_offset_change_s:
+            return limits.time_offset_s, limits.time_offset_change_s
+        return fit.time_offset_s, math.hypot(fit.time_offset_sigma_s, _TIME_OFFSET_MODEL_ERROR * fit.time_offset_s)
 
-    def _forget(self) -> None:
-        """Start collecting anew, since what was collected belongs to another rectification."""
-        self._rows.forget_turn()
-        self._yaw = YawEstimator(self._uncertain)
+    def _reset(self) -> None:
+        """Discard the evidence, which belongs to the previous rectification."""
+        self._rows.reset_rotation()
+        self._yaw = YawEstimator(self._motion_uncertainty)
         self._fit = None
         self._agreeing = 0
 
-    def _judge_rows(self, median_px: float, f_px: float, nominal_m: float) -> list[ExtrinsicsFinding]:
+    def _check_rows(self, median_px: float, f_px: float, nominal_m: float) -> list[ExtrinsicsFinding]:
         fit, limits = self._fit, self.limits
         assert fit is not None
-        turn_px = f_px * np.abs([fit.pitch_rad, 0.4 * fit.roll_rad])
-        sure = np.abs([fit.pitch_rad, fit.roll_rad]) > limits.strong_sigmas * np.array(
+        rows_px = f_px * np.abs([fit.pitch_rad, _EDGE * fit.roll_rad])
+        strong = np.abs([fit.pitch_rad, fit.roll_rad]) > limits.strong_sigmas * np.array(
             [fit.pitch_sigma_rad, fit.roll_sigma_rad]
         )
-        if not np.any((turn_px > limits.rows_px) & sure):
+        if not np.any((rows_px > limits.rows_px) & strong):
             self._agreeing = 0
-            return self._unexplained(fit, median_px)
+            return self._check_residual(fit, median_px)
         self._agreeing += 1
-        if self._agreeing < (limits.frames if self._rows.sharp else limits.unsharp_frames):
-            return self._once(
-                ExtrinsicsFault.ROWS, f"rows differ by {median_px:.2f} px: watching whether an eye has turned"
+        if self._agreeing < (limits.frames if self._rows.time_offset_known else limits.unsharp_frames):
+            return self._report_once(
+                ExtrinsicsFault.ROWS, f"rows differ by {median_px:.2f} px: observing whether a camera has rotated"
             )
-        turn = np.array([fit.pitch_rad if sure[0] else 0.0, 0.0, fit.roll_rad if sure[1] else 0.0])
-        text = f"the right eye has turned by {math.degrees(turn[0]):+.3f} deg in pitch and "
+        turn = np.array([fit.pitch_rad if strong[0] else 0.0, 0.0, fit.roll_rad if strong[1] else 0.0])
+        text = f"the right camera has rotated by {math.degrees(turn[0]):+.3f} deg in pitch and "
         return self._turn(ExtrinsicsFault.TURNED, turn, nominal_m, f"{text}{math.degrees(turn[2]):+.3f} deg in roll")
 
-    def _unexplained(self, fit: RowFit, median_px: float) -> list[ExtrinsicsFinding]:
-        """Rows that differ though no turn and no time offset explains it."""
+    def _check_residual(self, fit: RowFit, median_px: float) -> list[ExtrinsicsFinding]:
+        """Report row offsets that neither a rotation nor a time offset explains."""
         if fit.residual_px < 2 * self.limits.rows_px or fit.count < 5 * self.limits.points:
             return []
-        return self._once(
-            ExtrinsicsFault.UNEXPLAINED, f"rows differ by {median_px:.2f} px and no turn of an eye explains it"
+        return self._report_once(
+            ExtrinsicsFault.UNEXPLAINED, f"rows differ by {median_px:.2f} px, which no rotation of a camera explains"
         )
 
-    def _judge_yaw(self, f_px: float, nominal_m: float) -> list[ExtrinsicsFinding]:
+    def _check_yaw(self, f_px: float, nominal_m: float) -> list[ExtrinsicsFinding]:
         yaw, sigma, limits = self._yaw.yaw_rad, self._yaw.sigma_rad, self.limits
         sharp = sigma * f_px <= limits.yaw_sigma_px
         needed = limits.strong_sigmas * (0.5 if sharp else 1.0)
         if not abs(yaw) * f_px >= limits.yaw_px or abs(yaw) < needed * sigma:
             return []
-        text = f"the right eye has turned by {math.degrees(yaw):+.3f} deg in yaw ({yaw * f_px:+.2f} px of disparity)"
+        text = f"the right camera has rotated by {math.degrees(yaw):+.3f} deg in yaw ({yaw * f_px:+.2f} px of disparity)"
         return self._turn(ExtrinsicsFault.YAW, np.array([0.0, yaw, 0.0]), nominal_m, text)
 
-    def _late_off_s(self, fit: RowFit) -> float:
-        return abs(abs(fit.late_s) - self.limits.late_s)
+    def _time_offset_error_s(self, fit: RowFit) -> float:
+        return abs(abs(fit.time_offset_s) - self.limits.time_offset_s)
 
-    def _is_late(self, fit: RowFit) -> bool:
-        least_s = max(self.limits.late_largest_s, self.limits.strong_sigmas * fit.late_sigma_s)
-        return self._late_off_s(fit) > least_s
+    def _time_offset_is_excessive(self, fit: RowFit) -> bool:
+        least_s = max(self.limits.time_offset_largest_s, self.limits.strong_sigmas * fit.time_offset_sigma_s)
+        return self._time_offset_error_s(fit) > least_s
 
-    def _judge_late(self) -> list[ExtrinsicsFinding]:
+    def _check_time_offset(self) -> list[ExtrinsicsFinding]:
         fit, limits = self._fit, self.limits
-        if fit is None or fit.late_sigma_s > SHARP_S or self._agreeing:
+        if fit is None or fit.time_offset_sigma_s > TIME_OFFSET_SIGMA_S or self._agreeing:
             return []
-        off_s = self._late_off_s(fit)
-        if off_s < limits.late_change_s + 3.0 * fit.late_sigma_s:
+        off_s = self._time_offset_error_s(fit)
+        if off_s < limits.time_offset_change_s + 3.0 * fit.time_offset_sigma_s:
             return []
-        text = f"the right eye exposes {fit.late_s * 1e3:.1f} ms late, not {limits.late_s * 1e3:.1f} ms as declared"
-        return self._once(ExtrinsicsFault.LATE, text)
+        text = (
+            f"the right camera exposes {fit.time_offset_s * 1e3:.1f} ms after the left one, "
+            f"not {limits.time_offset_s * 1e3:.1f} ms as declared"
+        )
+        return self._report_once(ExtrinsicsFault.TIME_OFFSET, text)
 
     def _turn(self, what: ExtrinsicsFault, turn_rect_rad: Array, nominal_m: float, text: str) -> list[ExtrinsicsFinding]:
-        """Turn the rig's right eye, unless it has turned so far in all that it must be broken."""
+        """Correct the rig by a rotation (3,), unless the total rotation exceeds any drift."""
         turned = turned_rig(self.rig, turn_rect_rad, nominal_m)
-        total = turn_between(self.rig, nominal_m, R_from_rotvec(turn_rect_rad)) @ self._turned
+        total = rotation_in_cam0(self.rig, nominal_m, R_from_rotvec(turn_rect_rad)) @ self._turned
         angle = math.acos(max(-1.0, min(1.0, (float(np.trace(total)) - 1.0) / 2.0)))
         if angle > self.limits.largest_rad:
             if what is ExtrinsicsFault.YAW and self._yaw.pairs < self.limits.yaw_pairs:
-                return self._once(ExtrinsicsFault.DOUBTED, f"{text}: more than a drift, if it is confirmed")
+                return self._report_once(ExtrinsicsFault.UNCONFIRMED, f"{text}: more than a drift, not yet confirmed")
             self._agreeing, self.broken = 0, True
-            return self._once(ExtrinsicsFault.BROKEN, f"{text}: too far for a drift; land and calibrate again")
+            return self._report_once(ExtrinsicsFault.BROKEN, f"{text}: too far for a drift; land and calibrate again")
         self.rig, self._turned = turned, total
         return [ExtrinsicsFinding(what, True, f"{text}; corrected")]
 
-    def _once(self, what: ExtrinsicsFault, text: str) -> list[ExtrinsicsFinding]:
-        if what in self._told:
+    def _report_once(self, what: ExtrinsicsFault, text: str) -> list[ExtrinsicsFinding]:
+        if what in self._reported:
             return []
-        self._told.add(what)
+        self._reported.add(what)
         return [ExtrinsicsFinding(what, False, text)]
 
     def _report(
@@ -280,34 +295,37 @@ class ExtrinsicsMonitor:
             roll_sigma_rad=known.roll_sigma_rad,
             yaw_rad=self._yaw.yaw_rad,
             yaw_sigma_rad=self._yaw.sigma_rad,
-            late_s=known.late_s,
-            late_sigma_s=known.late_sigma_s,
+            time_offset_s=known.time_offset_s,
+            time_offset_sigma_s=known.time_offset_sigma_s,
             findings=findings,
         )
 
 
 def turned_rig(rig: RigModel, turn_rect_rad: Array, nominal_m: float) -> RigModel:
-    """Return the rig with its right eye turned by a rotation vector (3,) in the rectified axes at a baseline."""
-    turn = turn_between(rig, nominal_m, R_from_rotvec(turn_rect_rad))
+    """Return the rig with its right camera rotated by a rotation vector (3,), rad, in rect axes at a nominal baseline.
+
+    Raises CalibrationError outside the calibrated range.
+    """
+    turn = rotation_in_cam0(rig, nominal_m, R_from_rotvec(turn_rect_rad))
     return replace(rig, baselines=tuple(_turned(baseline, rig, turn) for baseline in rig.baselines))
 
 
-def rows_apart_rad(rig: RigModel, nominal_m: float, true_m: float) -> float:
-    """Return by what angle rows are apart, at most, when a rig at one baseline is rectified as if at another.
+def row_mismatch_rad(rig: RigModel, nominal_m: float, true_m: float) -> float:
+    """Return the largest row offset, rad, of a rig at the baseline `true_m` that is rectified as if at `nominal_m`.
 
-    Pitch counts in full; roll, and the slope of the line between the eyes, up to the edge of the view and to the
-    disparity of near things, 0.4 focal lengths both.
+    Sum of pitch, and of roll and the slope of the baseline at the edge of the view. Raises CalibrationError outside
+    the calibrated range.
     """
     T, T_true = rig.T_cam0_cam1(nominal_m), rig.T_cam0_cam1(true_m)
     R_rect_cam0 = rectifying_rotation(T[:3, 3])
     turn = R_rect_cam0 @ T_true[:3, :3] @ T[:3, :3].T @ R_rect_cam0.T
     slope = float((R_rect_cam0 @ T_true[:3, 3])[1]) / float(np.linalg.norm(T_true[:3, 3]))
     pitch, roll = (turn[2, 1] - turn[1, 2]) / 2.0, (turn[1, 0] - turn[0, 1]) / 2.0
-    return abs(float(pitch)) + 0.4 * abs(float(roll)) + 0.4 * abs(slope)
+    return abs(float(pitch)) + _EDGE * abs(float(roll)) + _EDGE * abs(slope)
 
 
-def turn_between(rig: RigModel, nominal_m: float, R_turn_rect: Array) -> Array:
-    """Return a turn given in rectified axes at a baseline in those of cam0."""
+def rotation_in_cam0(rig: RigModel, nominal_m: float, R_turn_rect: Array) -> Array:
+    """Return a rotation (3, 3) given in rect axes at a nominal baseline, in cam0 axes."""
     R_rect_cam0 = rectifying_rotation(rig.T_cam0_cam1(nominal_m)[:3, 3])
     return np.asarray(R_rect_cam0.T @ R_turn_rect @ R_rect_cam0)
 

@@ -1,7 +1,7 @@
-"""Images that must not be flown on: frozen, dark, burnt out, blank, eyes swapped, rows that do not align.
+"""Checks of the images: frozen, dark, overexposed, blank, swapped cameras, misaligned rows, different scenes.
 
-Every check is on the safe side of doubt for its kind: a healthy camera in front of a bare wall or at dusk must not
-trip it, since a fault takes the sticks to neutral. What follows from a fault is decided elsewhere.
+Every limit is set against false alarms, since a fault takes the sticks to neutral: a healthy camera in front of a
+bare wall or at dusk must pass. What follows from a fault is decided elsewhere.
 """
 
 from __future__ import annotations
@@ -19,113 +19,141 @@ from morpheyes_daemon.stereo.matching import MatchSettings, semi_global
 
 
 class ImageFault(StrEnum):
-    """What is wrong with a stereo frame; `text` is for a person."""
+    """A fault of a stereo frame; `text` explains it to a person."""
 
     text: str
 
     def __new__(cls, code: str, text: str) -> ImageFault:
+        """Return the member of a code with its text."""
         member = str.__new__(cls, code)
         member._value_ = code
         member.text = text
         return member
 
-    FROZEN = "frozen", "an eye sends the same image again"
-    DARK = "dark", "an eye sees next to nothing: lens cap, night, or a dead sensor"
-    BURNT = "burnt", "an eye is burnt out: exposure, or the sun"
-    BLANK = "blank", "an eye shows one even grey"
-    SWAPPED = "swapped", "the left and the right eye are swapped"
-    MISALIGNED = "misaligned", "the rows of the eyes do not align: bent rig or wrong calibration"
-    UNLIKE = "unlike", "the eyes do not see the same scene"
-    APART = "apart", "the rows of the eyes stay apart: not exposed together, bent, or another rig's calibration"
+    FROZEN = "frozen", "a camera repeats its last image"
+    DARK = "dark", "a camera image is dark: lens cap, night, or a dead sensor"
+    BURNT = "burnt", "a camera image is overexposed: exposure setting, or the sun"
+    BLANK = "blank", "a camera image is uniformly grey"
+    SWAPPED = "swapped", "the left and the right camera are swapped"
+    MISALIGNED = "misaligned", "the rows of the two images do not align: bent rig or wrong calibration"
+    SCENE_MISMATCH = "scene_mismatch", "the cameras do not see the same scene"
+    ROW_MISMATCH = (
+        "row_mismatch",
+        "the rows of the images keep differing: unsynchronized cameras, bent rig, or another rig's calibration",
+    )
 
+
+_COARSE_DISPARITIES = 48
+"""Disparities searched in the coarse pair, pixels: 30 % of its width of 160 px."""
 
 MAX_SHIFT_ROWS = 12
-"""Largest row shift that is recognized in the coarse pair: 48 rows at 640x480."""
+"""Largest row shift that is recognized, pixels of the coarse pair (48 rows at 640x480); chosen: a larger one leaves
+too few rows to correlate."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageLimits:
-    """Where a fault begins. Grey levels are of 255; fractions of the image; rows in pixels of the rectified image."""
+    """Limits of the faults; grey levels of 255, fractions of the image, angles in radians.
+
+    Those of `PairCheck` are measured (see there); the others are chosen: tighter limits stop healthy flights.
+    """
 
     dark_below: int = 12
+    """99th percentile of the grey levels below which an image is dark."""
     burnt_above: int = 250
     burnt_fraction: float = 0.5
+    """Fraction of pixels at `burnt_above` or more from which an image is overexposed."""
     blank_spread: float = 1.5
+    """Standard deviation of the grey levels below which an image is blank."""
     suspicious_valid_fraction: float = 0.45
+    """Fraction of pixels with depth below which other arrangements of the images are tried."""
     better_gain: float = 2.0
     better_share: float = 0.35
-    alike_share: float = 0.3
+    """Another arrangement must match `better_gain` times as many pixels, and at least this fraction."""
+    found_share: float = 0.3
+    """Share of textured points found in the right image below which the scenes differ."""
     textured_share: float = 0.3
     textured_levels: float = 5.0
-    alike_points: int = 40
-    unlike_frames: int = 3
-    unlike_of: int = 4
-    unlike_rad: float = 1e-2
-    vouching_points: int = 16
-    vouching_rad: float = 1e-3
-    apart_rad: float = 3.2e-3
-    apart_frames: int = 5
-    apart_of: int = 8
+    """Local standard deviation from which a pixel is textured; `textured_share` of the left image must be."""
+    least_points: int = 40
+    """Textured points below which nothing is concluded."""
+    scene_mismatch_frames: int = 3
+    scene_mismatch_of: int = 4
+    """M-of-N confirmation: scene_mismatch_frames of the last scene_mismatch_of."""
+    scene_mismatch_rad: float = 1e-2
+    """Median row offset beyond which matches are false."""
+    confirming_points: int = 16
+    confirming_rad: float = 1e-3
+    """So many matches with a smaller median row offset confirm that both cameras see one scene."""
+    row_mismatch_limit_rad: float = 3.2e-3
+    row_mismatch_frames: int = 5
+    row_mismatch_of: int = 8
+    """M-of-N confirmation of a median row offset beyond row_mismatch_limit_rad."""
 
 
 class FrozenCheck:
-    """Tells an image that is sent again: a sensor's noise never repeats itself."""
+    """Detects a repeated image: the noise of a sensor never repeats."""
 
     def __init__(self) -> None:
         self._last: tuple[Image, Image] | None = None
 
     def check(self, left: Image, right: Image) -> bool:
-        """Return True when either raw image equals the one before it."""
+        """Return True when either raw image (H, W[, 3]) equals the one before it."""
         last, self._last = self._last, (left, right)
         return last is not None and (_same(last[0], left) or _same(last[1], right))
 
 
 class PairCheck:
-    """Tells eyes that see different things, or the same at different times, or through another calibration.
+    """Detects cameras that see different scenes, expose at different times, or belong to another calibration.
 
-    Of flights at 320x240 (forest, seeds 0 to 3) 0.44 to 0.89 of the textured places of the left are found again in
-    the right, with the eyes swapped 0.0 to 0.36, half of them below 0.03, and where it is more (0.5 in one flight) their
-    rows are 12 mrad apart, which is as good as not found. One frame is no proof. Nor is it for rows that are apart by
-    less: 2 ms between the eyes make 4 mrad in a quick pitch, in one frame of 20 of those flights; with 20 ms every
-    second frame shows as much, and the calibration of another rig 5 mrad in all.
+    Measured in flights at 320x240 (`morpheyes sim forest --size 320x240`, seeds 0 to 3): of the textured points of
+    the left image 0.44 to 0.89 are found in the right one. With swapped cameras it is 0.0 to 0.36, half of the frames
+    below 0.03; one flight has 0.5, at a row offset of 12 mrad, which `scene_mismatch_rad` rejects. A time offset of
+    2 ms makes 4 mrad in a quick pitch, in one frame of 20; with 20 ms every second frame has as much, and the
+    calibration of another rig makes 5 mrad. Hence the M-of-N confirmation.
 
-    Few places are found again, too, where all that is seen is far, thin and hazy (0.2 of a sparse forest, with the eyes
-    together). Those that are found vouch for the eyes then, when there are some and their rows agree to a milliradian.
+    Few points are found, too, where the scene is far, thin and hazy (0.2 in a sparse forest, healthy cameras). The
+    found ones then confirm the pair, when there are `confirming_points` with rows within `confirming_rad`.
     """
 
     def __init__(self, limits: ImageLimits | None = None) -> None:
         self._limits = limits or ImageLimits()
-        self._unlike: deque[bool] = deque(maxlen=self._limits.unlike_of)
-        self._apart: deque[bool] = deque(maxlen=self._limits.apart_of)
+        self._scene_mismatch: deque[bool] = deque(maxlen=self._limits.scene_mismatch_of)
+        self._row_mismatch: deque[bool] = deque(maxlen=self._limits.row_mismatch_of)
 
-    def check(self, left: Image, found: RowOffsets, f_px: float, doubt_rad: float = 0.0) -> set[ImageFault]:
-        """Look at a rectified grey left image (H, W), what was found of it in the right one, and focal length.
+    def check(self, left: Image, found: RowOffsets, f_px: float, row_uncertainty_rad: float = 0.0) -> set[ImageFault]:
+        """Return the confirmed faults after one more frame.
 
-        `doubt_rad` is how far the eyes may point elsewhere than the pair was rectified for.
+        `left` (H, W) is the rectified grey left image, `found` its points in the right one, `f_px` the focal length.
+        `row_uncertainty_rad` is added to the limits: the row offset that an uncertain baseline can cause.
         """
         limits = self._limits
-        astray = found.count >= MIN_POINTS and found.median_px > (limits.unlike_rad + doubt_rad) * f_px
-        vouch = found.count >= limits.vouching_points and found.median_px < limits.vouching_rad * f_px
-        few = found.count < limits.alike_share * found.tried and not vouch
-        unlike = found.tried >= limits.alike_points and (few or astray)
+        rows_far_off = (
+            found.count >= MIN_POINTS and found.median_px > (limits.scene_mismatch_rad + row_uncertainty_rad) * f_px
+        )
+        confirmed = found.count >= limits.confirming_points and found.median_px < limits.confirming_rad * f_px
+        few = found.count < limits.found_share * found.tried and not confirmed
+        unlike = found.tried >= limits.least_points and (few or rows_far_off)
         unlike = unlike and _textured_share(left, limits.textured_levels) > limits.textured_share
-        self._unlike.append(unlike)
-        apart = found.count >= MIN_POINTS and found.median_px > (limits.apart_rad + doubt_rad) * f_px
-        self._apart.append(unlike or apart)
-        faults = {ImageFault.UNLIKE} if sum(self._unlike) >= limits.unlike_frames else set()
-        return faults | ({ImageFault.APART} if sum(self._apart) >= limits.apart_frames else set())
+        self._scene_mismatch.append(unlike)
+        apart = (
+            found.count >= MIN_POINTS and found.median_px > (limits.row_mismatch_limit_rad + row_uncertainty_rad) * f_px
+        )
+        self._row_mismatch.append(unlike or apart)
+        faults = {ImageFault.SCENE_MISMATCH} if sum(self._scene_mismatch) >= limits.scene_mismatch_frames else set()
+        return faults | ({ImageFault.ROW_MISMATCH} if sum(self._row_mismatch) >= limits.row_mismatch_frames else set())
 
 
 def exposure_faults(left: Image, right: Image, limits: ImageLimits | None = None) -> set[ImageFault]:
-    """Return what is wrong with how bright a grey pair (H, W) is; every eighth pixel is looked at."""
+    """Return the exposure faults of a grey pair (H, W), from every eighth pixel of every eighth row."""
     limits = limits or ImageLimits()
     faults = set()
-    for eye in (left[::8, ::8], right[::8, ::8]):
-        if np.percentile(eye, 99.0) < limits.dark_below:
+    for side in (left[::8, ::8], right[::8, ::8]):
+        if np.percentile(side, 99.0) < limits.dark_below:
             faults.add(ImageFault.DARK)
-        elif np.mean(eye >= limits.burnt_above) > limits.burnt_fraction:
+        elif np.mean(side >= limits.burnt_above) > limits.burnt_fraction:
             faults.add(ImageFault.BURNT)
-        elif float(eye.std()) < limits.blank_spread:
+        elif float(side.std()) < limits.blank_spread:
             faults.add(ImageFault.BLANK)
     return faults
 
@@ -133,10 +161,10 @@ def exposure_faults(left: Image, right: Image, limits: ImageLimits | None = None
 def matching_faults(
     left: Image, right: Image, valid_fraction: float, limits: ImageLimits | None = None
 ) -> set[ImageFault]:
-    """Return why a rectified grey pair (H, W) has so little depth, if it matches far better in another way.
+    """Return swapped or misaligned cameras as the cause of little depth in a rectified grey pair (H, W).
 
-    Swapped eyes have negative disparities only; rows that are off by many pixels match once they are shifted. A pair
-    with enough depth (`valid_fraction`) is not looked at; the others are, coarsely, the other way round and shifted.
+    A pair with a `valid_fraction` below the limit is matched coarsely with the images exchanged (swapped cameras have
+    negative disparities only) and with the rows shifted; an arrangement that matches far better is the cause.
     """
     limits = limits or ImageLimits()
     if valid_fraction >= limits.suspicious_valid_fraction:
@@ -145,17 +173,17 @@ def matching_faults(
     enough = max(limits.better_share, limits.better_gain * _matched_share(small_left, small_right))
     if _matched_share(small_right, small_left) >= enough:
         return {ImageFault.SWAPPED}
-    about = row_shift(small_left, small_right)
-    tried = (np.roll(small_right, -rows, axis=0) for rows in (about, about - 1, about + 1) if rows)
-    return {ImageFault.MISALIGNED} if any(_matched_share(small_left, eye) >= enough for eye in tried) else set()
+    shift = row_shift(small_left, small_right)
+    shifted = (np.roll(small_right, -rows, axis=0) for rows in (shift, shift - 1, shift + 1) if rows)
+    return {ImageFault.MISALIGNED} if any(_matched_share(small_left, image) >= enough for image in shifted) else set()
 
 
 def row_shift(left: Image, right: Image) -> int:
-    """Return by about how many rows the right image (H, W) lies lower, from the rows' mean vertical gradients.
+    """Return by how many rows the right image (H, W) lies lower, to about one row.
 
-    Parallax moves things within their rows, so the means keep their pattern, to a row or so.
+    Correlates the mean vertical gradient of each row, which parallax along the rows hardly changes.
     """
-    profiles = [cv2.Sobel(eye, cv2.CV_32F, 0, 1).mean(axis=1, dtype=np.float64) for eye in (left, right)]
+    profiles = [cv2.Sobel(side, cv2.CV_32F, 0, 1).mean(axis=1, dtype=np.float64) for side in (left, right)]
     edge = MAX_SHIFT_ROWS
     inner = profiles[0][edge:-edge]
     with np.errstate(invalid="ignore", divide="ignore"):  # an even image has no pattern: NaN, no match
@@ -172,14 +200,14 @@ def _small(image: Image) -> Image:
 
 
 def _matched_share(left: Image, right: Image) -> float:
-    """Return the share of a small pair that matches with a disparity of at least one pixel."""
+    """Return the fraction of a coarse pair that matches with a disparity of at least one pixel."""
     settings = MatchSettings()
-    disparity = semi_global(left, right, 0, 48, settings, settings.coarse_speckle_px)
+    disparity = semi_global(left, right, range(_COARSE_DISPARITIES), settings, settings.coarse_speckle_px)
     return float(np.mean(disparity >= 1.0))
 
 
 def _textured_share(image: Image, levels: float) -> float:
-    """Return the share of a grey image whose neighbourhood of 9 pixels spreads by more than `levels`."""
+    """Return the fraction of pixels whose 9x9 neighbourhood has a standard deviation above `levels`."""
     grey = image.astype(np.float32)
     mean, square = cv2.blur(grey, (9, 9)), cv2.blur(grey * grey, (9, 9))
     return float(np.mean(square - mean * mean > levels * levels))

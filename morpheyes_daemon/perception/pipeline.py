@@ -1,4 +1,4 @@
-"""What happens to one stereo frame: rectify, match, judge the images, let the strategy look.
+"""Processing of one stereo frame: rectification, matching, monitors, image checks, and the strategy's `perceive`.
 
 Runs in the vision worker (another process) in real time and inline in lockstep; the same object either way.
 """
@@ -14,6 +14,7 @@ import numpy as np
 from morpheyes_daemon.clock import stopwatch_s
 from morpheyes_daemon.config.vehicle import MissionFile, VehicleConfig
 from morpheyes_daemon.messages.core import (
+    SECTORS,
     DepthMap,
     DepthSummary,
     Event,
@@ -27,7 +28,7 @@ from morpheyes_daemon.messages.core import (
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.perception.camera_motion import CameraMotion, camera_motion
 from morpheyes_daemon.perception.craft import build_craft, build_strategy
-from morpheyes_daemon.perception.depth_scale_monitor import DepthScaleMonitor, Sight
+from morpheyes_daemon.perception.depth_scale_monitor import DepthScaleMonitor, ScaleObservation
 from morpheyes_daemon.perception.extrinsics_monitor import ExtrinsicsFault, ExtrinsicsLimits, ExtrinsicsMonitor
 from morpheyes_daemon.perception.image_checks import (
     FrozenCheck,
@@ -41,16 +42,18 @@ from morpheyes_daemon.stereo.epipolar import RowOffsets, row_offsets
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.strategies.base import View
 
-_REASONS = {ImageFault.MISALIGNED: Reason.CALIBRATION_DRIFT, ImageFault.APART: Reason.EYES_APART}
-"""What is no fault of the images but of the rig."""
+_REASONS = {ImageFault.MISALIGNED: Reason.CALIBRATION_DRIFT, ImageFault.ROW_MISMATCH: Reason.EYES_APART}
+"""Faults of the rig; all others are IMAGE_BAD."""
 
-SECTORS = 72
-"""Sectors of OBSTACLE_DISTANCE over the horizontal field of view."""
+_OUTLIER_PIXELS = 4
+"""Nearest pixels of a column that a sector ignores; chosen: single false matches; more would miss thin branches."""
+_RECORDED_WIDTH_PX = 320
+"""Width of recorded images, pixels; chosen: size of the log against detail."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisionJob:
-    """One frame with the vehicle's state at its exposure; `keep_images` asks for the small pictures."""
+    """One raw frame with the vehicle state at its mid-exposure; `keep_images` asks for the images of the recorder."""
 
     frame: StereoFrame
     vehicle: VehicleState
@@ -59,30 +62,34 @@ class VisionJob:
 
 @dataclass(frozen=True, slots=True)
 class PipelineFactory:
-    """Builds a `Pipeline` in whichever process it is needed; picklable."""
+    """Builds a `Pipeline`; picklable, so that the vision worker can build its own."""
 
     config: VehicleConfig
     mission: MissionFile
     rig: RigModel
 
     def __call__(self) -> Pipeline:
+        """Return the pipeline; raises ConfigError when the mission is invalid."""
         return Pipeline(self.config, self.mission, self.rig)
 
 
 class Pipeline:
-    """The image side of the daemon for one mission and one rig."""
+    """Image processing of the daemon for one mission and one rig."""
 
     def __init__(self, config: VehicleConfig, mission: MissionFile, rig: RigModel) -> None:
         self._estimator = DepthEstimator(rig, config.stereo, (config.camera.width_px, config.camera.height_px))
-        self._frozen, self._alike, self._scale = FrozenCheck(), PairCheck(), DepthScaleMonitor()
+        self._frozen, self._pair_check, self._depth_scale = FrozenCheck(), PairCheck(), DepthScaleMonitor()
         self._still_scene = mission.still_scene
-        limits = ExtrinsicsLimits(late_s=config.camera.sync_error_ms / 1e3, watch_yaw=mission.still_scene)
-        self._drift = ExtrinsicsMonitor(self._estimator.rig, limits)
+        limits = ExtrinsicsLimits(time_offset_s=config.camera.sync_error_ms / 1e3, watch_yaw=mission.still_scene)
+        self._extrinsics = ExtrinsicsMonitor(self._estimator.rig, limits)
         self._strategy = build_strategy(mission, config)
         self._T_frd_rig = build_craft(config).T_frd_rig
 
     def perceive(self, job: VisionJob) -> Perception:
-        """Return what one frame shows. Raises CalibrationError when the rig does not cover the frame's baseline."""
+        """Return depth, percept, faults and events of one frame.
+
+        Raises InputError on a wrong image size, CalibrationError when the rig does not cover the baseline.
+        """
         started_s = stopwatch_s()
         pair = self._estimator.rectified(job.frame)
         depth = self._estimator.depth(job.frame, pair)
@@ -105,15 +112,15 @@ class Pipeline:
     def _watch_calibration(
         self, frame: StereoFrame, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, motion: CameraMotion
     ) -> tuple[Event, ...]:
-        """Return what the drift watch noticed; the next frame is rectified by what it corrected."""
-        seen = self._drift.update(pair, depth, offsets, frame.baseline.moving, motion)
+        """Return the findings of the extrinsics monitor as events; the next frame is rectified by the corrected rig."""
+        seen = self._extrinsics.update(pair, depth, offsets, frame.baseline.moving, motion)
         if seen.rig_changed:
-            self._estimator = self._estimator.turned(self._drift.rig)
+            self._estimator = self._estimator.with_rig(self._extrinsics.rig)
         return tuple(
             Event(
                 frame.t_ns,
                 "calibration",
-                Reason.EYES_LATE if finding.what is ExtrinsicsFault.LATE else Reason.CALIBRATION_DRIFT,
+                Reason.EYES_LATE if finding.what is ExtrinsicsFault.TIME_OFFSET else Reason.CALIBRATION_DRIFT,
                 finding.text,
             )
             for finding in seen.findings
@@ -122,17 +129,18 @@ class Pipeline:
     def _image_faults(
         self, frame: StereoFrame, pair: RectifiedPair, depth: DepthMap, offsets: RowOffsets, motion: CameraMotion
     ) -> tuple[Reason, ...]:
-        """Return why the frame must not be flown on, empty when it may."""
+        """Return the reasons why the frame must not be used, empty for a good one."""
         found = exposure_faults(pair.left, pair.right)
         found |= matching_faults(pair.left, pair.right, depth.valid_fraction)
-        left_over = self._drift.unexplained(offsets, depth)
-        found |= self._alike.check(pair.left, left_over, depth.pinhole.f_px, self._drift.doubt_rad(frame.baseline))
+        remaining = self._extrinsics.compensated(offsets, depth)
+        uncertainty_rad = self._extrinsics.row_uncertainty_rad(frame.baseline)
+        found |= self._pair_check.check(pair.left, remaining, depth.pinhole.f_px, uncertainty_rad)
         if self._frozen.check(frame.left, frame.right):
             found.add(ImageFault.FROZEN)
         reasons = {_REASONS.get(fault, Reason.IMAGE_BAD) for fault in found}
-        if self._drift.broken or self._drift.late:
+        if self._extrinsics.broken or self._extrinsics.out_of_sync:
             reasons.add(Reason.EYES_APART)
-        if self._still_scene and self._scale.check(Sight(pair.left, depth, motion)):
+        if self._still_scene and self._depth_scale.check(ScaleObservation(pair.left, depth, motion)):
             reasons.add(Reason.DEPTH_SCALE)
         return tuple(sorted(reasons, key=lambda reason: reason.number))
 
@@ -159,15 +167,16 @@ def summarize(depth: DepthMap, compute_s: float) -> DepthSummary:
 
 
 def sectors(depth: DepthMap) -> FloatMap:
-    """Return (72,) the nearest depth per sector of the view in the middle third of the rows, NaN where none.
+    """Return the nearest obstacle (SECTORS,) float32 metres per sector of the view, NaN where none.
 
-    Sectors are equal in angle. Pixels at the disparity ceiling count as the near limit.
+    Sectors are equal in angle over the horizontal field of view, left to right; only the middle third of the rows
+    counts. Pixels nearer than the near limit count as the near limit. Each column gives its fifth nearest pixel.
     """
     height = depth.depth_m.shape[0]
     rows = slice(height // 3, 2 * height // 3)
     middle = np.where(depth.near[rows], np.float32(depth.near_limit_m), depth.depth_m[rows])
     filled = np.where(np.isfinite(middle), middle, np.inf)
-    columns = np.partition(filled, 4, axis=0)[4]
+    columns = np.partition(filled, _OUTLIER_PIXELS, axis=0)[_OUTLIER_PIXELS]
     pinhole = depth.pinhole
     angle = np.arctan((np.arange(pinhole.width) - pinhole.cx_px) / pinhole.f_px)
     left = -math.atan((pinhole.cx_px + 0.5) / pinhole.f_px)
@@ -178,7 +187,7 @@ def sectors(depth: DepthMap) -> FloatMap:
 
 
 def _small(image: Image) -> Image:
-    scale = 320 / image.shape[1]
+    scale = _RECORDED_WIDTH_PX / image.shape[1]
     if scale >= 1.0:
         return frozen(image.copy())
     return frozen(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8))

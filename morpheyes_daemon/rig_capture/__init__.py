@@ -1,1 +1,1 @@
-"""Board pictures taken with the real camera and servo on a table; no flight."""
+"""Capture of board pictures with the real camera and servo on a table; no flight."""

@@ -1,6 +1,6 @@
-"""Taking board pictures at every baseline with a person holding the board: move, guide, keep what tells more.
+"""Capture of board pictures at every baseline with a hand-held board: moves the servo, guides, and keeps pairs.
 
-Every kept pair is on disk at once, so stopping in the middle loses nothing and starting again goes on from there.
+Every kept pair is written at once, so an interrupted capture can be continued.
 """
 
 from __future__ import annotations
@@ -22,107 +22,126 @@ from morpheyes_daemon.rig_capture.rig_session import RigSession
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What a person should see of the capture right now."""
+class CaptureStatus:
+    """State of the capture, to be shown to the person."""
 
     nominal_m: float
     guide: CaptureGuide
     hint: Hint
 
 
-Show = Callable[[Scene], None]
+Show = Callable[[CaptureStatus], None]
+"""Called after every pair."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardFolder:
+    """A folder of pictures and the board they show."""
+
+    path: Path
+    board: Board
+
+    def at(self, nominal_m: float) -> BoardFolder:
+        """Return the sub-folder of a nominal baseline."""
+        return BoardFolder(self.path / f"{nominal_m * 1e3:g}mm", self.board)
 
 
 async def capture_boards(
-    stand: RigSession, out: Path, board: Board, nominal_m: Sequence[float], wanted: int, show: Show
+    session: RigSession, out: BoardFolder, nominal_m: Sequence[float], wanted: int, show: Show
 ) -> dict[str, int]:
-    """Fill `out` with `wanted` pairs for each nominal baseline; returns how many each folder holds.
+    """Take `wanted` pairs at each nominal baseline; return the number of pairs in each folder.
 
-    Raises DeviceError when camera or servo fail, InputError when `out` cannot be written.
+    Raises DeviceError when camera or servo fail, InputError when `out` holds another board or cannot be written.
     """
-    note_board(out, board)
+    note_board(out)
     counts = {}
     for nominal in nominal_m:
-        folder = out / f"{nominal * 1e3:g}mm"
-        counts[folder.name] = await _one_baseline(stand, folder, board, nominal, wanted, show)
+        folder = out.at(nominal)
+        counts[folder.path.name] = await _one_baseline(session, folder, nominal, wanted, show)
     return counts
 
 
 async def capture_visits(
-    stand: RigSession, out: Path, board: Board, nominal_m: Sequence[float], visits: int, show: Show
+    session: RigSession, out: BoardFolder, nominal_m: Sequence[float], visits: int, show: Show
 ) -> dict[str, int]:
-    """Go to every baseline `visits` times in turn and take one pair each time, the board standing still in view."""
-    note_board(out, board)
+    """Visit all baselines `visits` times and take one pair of a fixed board each time; raises as `capture_boards`."""
+    note_board(out)
     counts: dict[str, int] = {}
     for _ in range(visits):
         for nominal in nominal_m:
-            folder = out / f"{nominal * 1e3:g}mm"
-            counts[folder.name] = await _one_visit(stand, folder, board, nominal, show)
+            folder = out.at(nominal)
+            counts[folder.path.name] = await _one_visit(session, folder, nominal, show)
     return counts
 
 
-def note_board(out: Path, board: Board) -> None:
-    """Write board.yaml; raises InputError when the folder holds pictures of another board."""
+def note_board(out: BoardFolder) -> None:
+    """Write board.yaml; raises InputError when the folder holds pictures of another board or cannot be written."""
+    board = out.board
     content = {"board": board.label, "square_mm": board.square_m * 1e3}
     if board.kind == "charuco":
         content["marker_mm"] = board.square_m * board.marker_share * 1e3
-    path = out / "board.yaml"
+    path = out.path / "board.yaml"
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        out.path.mkdir(parents=True, exist_ok=True)
         known = parse_yaml(read_text(path), str(path))[0] if path.is_file() else content
     except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); name another folder.") from None
+        raise InputError(f"{out.path}: cannot be written ({error.strerror}); name another folder.") from None
     if not isinstance(known, dict) or {key: known.get(key) for key in content} != content:
-        raise InputError(f"{path}: is of another board; name a new folder or give the same board.")
+        raise InputError(f"{path}: describes another board; name a new folder or give the same board.")
     path.write_text(yaml.safe_dump({**known, **content}, sort_keys=False), encoding="utf-8")
 
 
-async def _one_baseline(stand: RigSession, folder: Path, board: Board, nominal_m: float, wanted: int, show: Show) -> int:
-    number = _last_number(folder)
+async def _one_baseline(session: RigSession, folder: BoardFolder, nominal_m: float, wanted: int, show: Show) -> int:
+    number = _last_number(folder.path)
     if number >= wanted:
         return number
-    await stand.place(nominal_m)
+    await session.place(nominal_m)
     guide: CaptureGuide | None = None
     while number < wanted:
-        pair = await stand.pair()
-        guide = guide or CaptureGuide(board, (pair.left.shape[1], pair.left.shape[0]), wanted - number)
+        pair = await session.pair()
+        guide = guide or CaptureGuide(folder.board, (pair.left.shape[1], pair.left.shape[0]), wanted - number)
         hint = guide.consider(pair.left, pair.right)
         if hint.kept:
             number += 1
-            write_pair(folder, number, pair)
-        show(Scene(nominal_m, guide, hint))
+            write_pair(folder.path, number, pair)
+        show(CaptureStatus(nominal_m, guide, hint))
     return number
 
 
-async def _one_visit(stand: RigSession, folder: Path, board: Board, nominal_m: float, show: Show) -> int:
-    await stand.place(nominal_m)
-    number = _last_number(folder)
+async def _one_visit(session: RigSession, folder: BoardFolder, nominal_m: float, show: Show) -> int:
+    await session.place(nominal_m)
+    number = _last_number(folder.path)
     while True:
-        pair = await stand.pair()
-        guide = CaptureGuide(board, (pair.left.shape[1], pair.left.shape[0]), 1)
+        pair = await session.pair()
+        guide = CaptureGuide(folder.board, (pair.left.shape[1], pair.left.shape[0]), 1)
         guide.consider(pair.left, pair.right)
-        again = await stand.pair()
+        again = await session.pair()
         hint = guide.consider(again.left, again.right)
-        show(Scene(nominal_m, guide, hint))
+        show(CaptureStatus(nominal_m, guide, hint))
         if hint.kept:
-            write_pair(folder, number + 1, again)
+            write_pair(folder.path, number + 1, again)
             return number + 1
 
 
 def write_pair(folder: Path, number: int, pair: RawPair) -> None:
-    """Write a pair as left and right pictures of a number, each whole or not at all."""
+    """Write a raw pair as left and right PNG files with a number, each through a temporary file.
+
+    Raises InputError when the folder cannot be written.
+    """
     try:
         folder.mkdir(exist_ok=True)
-        for eye, image in (("left", pair.left), ("right", pair.right)):
-            temporary = folder / f".{eye}.part.png"
+        for side, image in (("left", pair.left), ("right", pair.right)):
+            temporary = folder / f".{side}.part.png"
             cv2.imwrite(str(temporary), image)
-            temporary.replace(folder / f"{eye}{number:02d}.png")
+            temporary.replace(folder / f"{side}{number:02d}.png")
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}); free some space and go on.") from None
+        raise InputError(
+            f"{folder}: cannot be written ({error.strerror}); free some space and run the command again."
+        ) from None
 
 
 def _last_number(folder: Path) -> int:
-    """Return the number of the newest whole pair in the folder, 0 for none."""
+    """Return the highest number of a complete pair in the folder, 0 for none."""
     names = {path.name for path in folder.glob("*.png")} if folder.is_dir() else set()
     numbers = [int(match[1]) for name in names if (match := re.fullmatch(r"left(\d+)\.png", name))]
     return max((number for number in numbers if f"right{number:02d}.png" in names), default=0)

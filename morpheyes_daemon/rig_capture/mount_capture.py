@@ -1,7 +1,7 @@
-"""Taking pictures of a board that stands still with a vehicle that is turned by hand, and the attitude of each.
+"""Capture for `calibrate mount`: pictures of a fixed board from a vehicle that is rotated by hand, with attitudes.
 
-What `calibrate mount` takes: left and right pictures and a line of `attitudes.csv` for each. A picture is kept when
-the vehicle is held still and turned otherwise than in those kept before; it is on disk at once.
+Writes left and right pictures and one line of `attitudes.csv` for each pair. A pair is kept when the vehicle is still
+and its attitude differs from those kept before; it is written at once.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -24,21 +25,32 @@ from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.errors import DeviceTimeoutError, InputError
 from morpheyes_daemon.messages.core import Image, VehicleState
-from morpheyes_daemon.rig_capture.board_capture import note_board, write_pair
+from morpheyes_daemon.rig_capture.board_capture import BoardFolder, note_board, write_pair
 from morpheyes_daemon.rig_capture.rig_session import RigSession
 from morpheyes_daemon.transforms import Array, R_from_rpy, rotvec_from_R
 
 STILL_RAD_S = 0.03
+"""Largest turn rate of a still vehicle, rad/s; chosen: 0.3 mrad of motion in an exposure of 10 ms."""
+STILL_PX = 1.0
+"""Largest motion of a corner between two frames of a still vehicle, pixels; chosen: more blurs the corners."""
 FRESH_NS = S // 5
-OTHERWISE_RAD = math.radians(8.0)
-WAIT_S = 10.0
+"""Largest age of an attitude, nanoseconds; chosen: twice the period of a 10 Hz telemetry."""
+MIN_NEW_ROTATION_RAD = math.radians(8.0)
+"""Least rotation from every kept attitude, rad; chosen: smaller ones add little to the spread of 48 attitudes."""
+ATTITUDE_TIMEOUT_S = 10.0
+"""Longest wait for the first attitude, seconds; chosen: the heartbeats of an autopilot come every second."""
+_POLLS_PER_S = 20
+"""Checks for the first attitude per second; chosen: within one period of usual telemetry."""
 
-Say = Callable[[int, str], None]
-"""Told how many pictures are kept, and what to do next."""
+Show = Callable[[int, str], None]
+"""Called with the number of kept pictures and the advice after every pair."""
 
 
 class HandHeldVehicle:
-    """The autopilot's attitude over its link; use it with `async with`."""
+    """Attitude of the autopilot over its link; an asynchronous context manager.
+
+    Entering raises DeviceTimeoutError when no attitude arrives within ATTITUDE_TIMEOUT_S.
+    """
 
     def __init__(self, config: VehicleConfig, clock: Clock, opener: LinkOpener) -> None:
         self._clock = clock
@@ -46,12 +58,12 @@ class HandHeldVehicle:
 
     async def __aenter__(self) -> Self:
         await self._session.__aenter__()
-        for _ in range(round(WAIT_S * 20)):
+        for _ in range(round(ATTITUDE_TIMEOUT_S * _POLLS_PER_S)):
             if self.state.attitude_t_ns:
                 return self
-            await self._clock.sleep_until_ns(self._clock.now_ns() + S // 20)
+            await self._clock.sleep_until_ns(self._clock.now_ns() + S // _POLLS_PER_S)
         await self.__aexit__(None, None, None)
-        raise DeviceTimeoutError("The autopilot tells no attitude: see `morpheyes doctor`.")
+        raise DeviceTimeoutError("The autopilot sends no attitude; run `morpheyes doctor` to find out why.")
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -60,51 +72,73 @@ class HandHeldVehicle:
 
     @property
     def state(self) -> VehicleState:
-        """The newest state."""
+        """Newest vehicle state."""
         return self._session.vehicle
 
 
-async def capture_mount(
-    stand: RigSession, vehicle: Callable[[], VehicleState], clock: Clock, out: Path, board: Board, wanted: int, say: Say
-) -> int:
-    """Fill `out` with `wanted` pictures and attitudes, eyes at their smallest baseline; returns how many it holds.
+@dataclass(frozen=True, slots=True)
+class AttitudeSource:
+    """Reads the newest vehicle state; `clock` gives its age."""
 
-    Raises DeviceError when camera, servo or autopilot fail, InputError when `out` cannot be written.
+    read: Callable[[], VehicleState]
+    clock: Clock
+
+    def fresh(self, state: VehicleState) -> bool:
+        """Return whether the attitude of a state is at most FRESH_NS old."""
+        return self.clock.now_ns() - state.attitude_t_ns < FRESH_NS
+
+
+async def capture_mount(session: RigSession, attitude: AttitudeSource, out: BoardFolder, wanted: int, show: Show) -> int:
+    """Take pairs and attitudes at the smallest baseline until `out` holds `wanted`; return their number.
+
+    Raises DeviceError when camera, servo or autopilot fail, InputError when `out` holds another board or cannot be
+    written.
     """
-    note_board(out, board)
-    kept = [R for _, R in attitude_rows(out / ATTITUDES)] if (out / ATTITUDES).is_file() else []
+    note_board(out)
+    attitudes = out.path / ATTITUDES
+    kept = [R for _, R in attitude_rows(attitudes)] if attitudes.is_file() else []
     if len(kept) < wanted:
-        await stand.place(stand.range_m[0])
-    last: Array | None = None
+        await session.place(session.range_m[0])
+    selector = _Selector(out.board, kept)
     while len(kept) < wanted:
-        pair = await stand.pair()
-        state = vehicle()
-        R = R_from_rpy(state.roll_rad, state.pitch_rad, state.yaw_rad)
-        fresh = clock.now_ns() - state.attitude_t_ns < FRESH_NS
-        last, hint = _judged(pair.left, board, state, fresh, R, kept, last)
-        if not hint:
-            kept.append(R)
-            write_pair(out, len(kept), pair)
-            _note_attitude(out / ATTITUDES, f"left{len(kept):02d}.png", state)
-        say(len(kept), hint or "kept")
+        pair = await session.pair()
+        state = attitude.read()
+        advice = selector.evaluate(pair.left, state, attitude.fresh(state))
+        if not advice:
+            kept.append(_R_ned_frd(state))
+            write_pair(out.path, len(kept), pair)
+            _note_attitude(attitudes, f"left{len(kept):02d}.png", state)
+        show(len(kept), advice or "kept")
     return len(kept)
 
 
-def _judged(
-    left: Image, board: Board, state: VehicleState, fresh: bool, R: Array, kept: list[Array], last: Array | None
-) -> tuple[Array | None, str]:
-    """Return the board's corners and what to do; nothing when the picture is worth keeping."""
-    corners = find_corners(left, board)
-    if corners is None:
-        return None, "no whole board in the left picture"
-    if not fresh:
-        return corners, "the autopilot is not heard"
-    moved = last is None or last.shape != corners.shape or float(np.nanmax(np.abs(corners - last))) > 1.0
-    if moved or max(abs(rate) for rate in state.rates_frd_rad_s) > STILL_RAD_S:
-        return corners, "hold the vehicle still"
-    if any(np.linalg.norm(rotvec_from_R(other.T @ R)) < OTHERWISE_RAD for other in kept):
-        return corners, "turn it otherwise: onto its sides, nose up and down, from the left and right"
-    return corners, ""
+@dataclass
+class _Selector:
+    """Selects pictures: the board is found, the vehicle is still, and its attitude R_ned_frd (3, 3) is new."""
+
+    board: Board
+    kept: list[Array]
+    last: Array | None = None
+
+    def evaluate(self, left: Image, state: VehicleState, fresh: bool) -> str:
+        """Return the advice to the person, empty for a picture to keep; `left` is raw (H, W) or (H, W, 3)."""
+        last, self.last = self.last, find_corners(left, self.board)
+        corners = self.last
+        if corners is None:
+            return "no complete board in the left picture"
+        if not fresh:
+            return "no recent attitude from the autopilot"
+        moved = last is None or last.shape != corners.shape or float(np.nanmax(np.abs(corners - last))) > STILL_PX
+        if moved or max(abs(rate) for rate in state.rates_frd_rad_s) > STILL_RAD_S:
+            return "hold the vehicle still"
+        R = _R_ned_frd(state)
+        if any(np.linalg.norm(rotvec_from_R(other.T @ R)) < MIN_NEW_ROTATION_RAD for other in self.kept):
+            return "rotate the vehicle differently: onto its sides, nose up and down, from the left and right"
+        return ""
+
+
+def _R_ned_frd(state: VehicleState) -> Array:
+    return R_from_rpy(state.roll_rad, state.pitch_rad, state.yaw_rad)
 
 
 def _note_attitude(path: Path, picture: str, state: VehicleState) -> None:
@@ -117,4 +151,6 @@ def _note_attitude(path: Path, picture: str, state: VehicleState) -> None:
                 writer.writerow(COLUMNS)
             writer.writerow([picture, *(f"{math.degrees(angle):.4f}" for angle in angles)])
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); free some space and go on.") from None
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); free some space and run the command again."
+        ) from None

@@ -1,6 +1,6 @@
-"""Camera and servo of a rig on the table: move the eyes, wait until they rest, take a pair.
+"""Camera and servo of a rig on the table: moves to a baseline, waits until the servo rests, and takes pairs.
 
-The eyes approach every baseline by shrinking, as in flight, so that the servo's play is always on the same side.
+Every baseline is approached from above, as in flight, so that the backlash of the servo is always on the same side.
 """
 
 from __future__ import annotations
@@ -18,6 +18,9 @@ from morpheyes_daemon.devices.link import LinkOpener
 from morpheyes_daemon.devices.servo import Servo, build_servo
 from morpheyes_daemon.messages.core import RawPair
 
+_POLL_NS = 20 * MS
+"""Period at which the modelled motion is polled, nanoseconds; chosen: one period of a servo's control signal."""
+
 
 class RigSession:
     """An open camera and servo; use it with `async with`."""
@@ -29,7 +32,7 @@ class RigSession:
 
     @classmethod
     def of(cls, config: VehicleConfig, clock: Clock, opener: LinkOpener) -> Self:
-        """Return the stand of the configured devices, not yet open."""
+        """Return the session of the configured devices, not yet open; raises ConfigError for an unknown backend."""
         context = DeviceContext.alone(clock, opener)
         servo = build_servo(config.servo, context)
         return cls(build_camera(config.camera, context), servo, config, clock)
@@ -47,11 +50,11 @@ class RigSession:
 
     @property
     def range_m(self) -> tuple[float, float]:
-        """Smallest and largest baseline of the rig; equal for a fixed one."""
+        """Smallest and largest baseline of the rig, metres; equal for a fixed one."""
         return self._range_m
 
     async def place(self, nominal_m: float) -> None:
-        """Bring the eyes to a nominal baseline from above and wait until they rest there."""
+        """Move to a nominal baseline from above and wait until the modelled motion ends; raises DeviceError."""
         if self._range_m[0] == self._range_m[1]:
             return
         above_m = min(nominal_m + OVERSHOOT_M, self._range_m[1])
@@ -59,8 +62,8 @@ class RigSession:
             await self._servo.move(target_m)
             self._model.on_acknowledged(target_m, self._clock.now_ns())
             while self._model.at(self._clock.now_ns()).moving:
-                await self._clock.sleep_until_ns(self._clock.now_ns() + 20 * MS)
+                await self._clock.sleep_until_ns(self._clock.now_ns() + _POLL_NS)
 
     async def pair(self) -> RawPair:
-        """Wait for the next raw pair."""
+        """Return the next raw pair; raises DeviceError when the camera fails."""
         return await self._camera.read()

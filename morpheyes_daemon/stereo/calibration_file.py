@@ -1,7 +1,7 @@
-"""The calibration file: YAML that people can read, with frames and units in the keys and its own hash.
+"""The calibration file: readable YAML with frames and units in the keys and a hash of its content.
 
-The hash covers every value but itself, so a file that was cut short or edited is noticed; comments and layout
-are free. Numbers are written with 12 significant digits, far below what any calibration knows.
+The hash covers every value but itself, so a truncated or edited file is detected; comments and layout are free.
+Numbers have 12 significant digits, far below the uncertainty of any calibration.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, CameraMount, RigModel
 
 FORMAT = "morpheyes-calibration-1"
+"""Version of the file format, in its key `format`."""
 
 _HEADER = """\
 # Calibration of a stereo rig, as `morpheyes calibrate` writes and the daemon reads it.
 # T_cam0_cam1 takes points from the right camera's frame to the left one's (x right, y down, z forward).
-# Each pose belongs to a nominal baseline, what the servo is told; the true length is that of the translation.
+# Each pose belongs to a nominal baseline, the commanded one; the true baseline is the length of the translation.
 # Distortion is in the paper's order: radial k1, k2, k5, tangential k3, k4.
-# `mount` is the rotation vector of the left eye on the bar, where `morpheyes calibrate mount` has measured it.
+# `mount` is the rotation vector of the left camera on the bar, as measured by `morpheyes calibrate mount`.
 # sha256 covers every value here: do not edit, calibrate again instead.
 """
 _REMEDY = "fetch it from a copy, or make it again with `morpheyes calibrate solve`"
@@ -88,7 +89,7 @@ class _File(_Part):
 
 
 def read_calibration(path: Path) -> RigModel:
-    """Return the rig of a calibration file; raises CalibrationError naming the file and the remedy."""
+    """Return the rig of a calibration file; raises CalibrationError, naming file and remedy, when it is invalid."""
     try:
         data, root = parse_yaml(read_text(path), str(path))
     except ConfigError as error:
@@ -103,7 +104,10 @@ def read_calibration(path: Path) -> RigModel:
 
 
 def write_calibration(rig: RigModel, path: Path) -> None:
-    """Write `rig` to `path` through a temporary file beside it, so that a reader never sees half of it."""
+    """Write `rig` to `path` through a temporary file beside it, so that no reader gets an incomplete file.
+
+    Raises CalibrationError when it cannot be written.
+    """
     content = document(rig)
     text = _HEADER + yaml.safe_dump(
         {**content, "sha256": content_hash(content)}, sort_keys=False, default_flow_style=None, width=110
@@ -146,7 +150,7 @@ def _check_hash(data: Any, path: Path) -> None:
     if data["format"] != FORMAT:
         raise CalibrationError(f"{path}: has the format {data['format']!r}, but {FORMAT!r} is read here; {_REMEDY}.")
     if "sha256" not in data:
-        raise CalibrationError(f"{path}: has no sha256 at its end, so it was cut short; {_REMEDY}.")
+        raise CalibrationError(f"{path}: has no sha256 at its end, so it is truncated; {_REMEDY}.")
     content = {key: value for key, value in data.items() if key != "sha256"}
     if content_hash(content) != data["sha256"]:
         raise CalibrationError(f"{path}: does not match its own hash, so it was edited or damaged; {_REMEDY}.")
@@ -159,11 +163,11 @@ def _rig(file: _File) -> RigModel:
         baselines=tuple(_baseline(part) for part in file.baselines),
         method=file.method,
         details=file.details,
-        mount=None if file.mount is None else _eye_mount(file.mount),
+        mount=None if file.mount is None else _camera_mount(file.mount),
     )
 
 
-def _eye_mount(part: _Mount) -> CameraMount:
+def _camera_mount(part: _Mount) -> CameraMount:
     return CameraMount(_radians(part.rotation_deg), _radians(part.sigma_deg))
 
 
@@ -229,7 +233,7 @@ def _digits(value: float) -> float:
 
 
 def _plain(value: Any) -> Any:
-    """Return mappings, sequences and numpy numbers as what YAML and JSON both know."""
+    """Return mappings, sequences and numpy numbers as types that YAML and JSON share."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

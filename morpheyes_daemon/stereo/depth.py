@@ -1,7 +1,6 @@
-"""Depth with its uncertainty from a stereo frame: Z = b f / d, unknown kept unknown.
+"""Depth with its uncertainty from a stereo frame: Z = b f / d; pixels without a match stay unknown (NaN).
 
-Ties rectification and matching together. What a depth means for the flight, and what to do where there is none, is
-decided elsewhere.
+Composes rectification and matching. How depth is used, and what is done where there is none, is decided elsewhere.
 """
 
 from __future__ import annotations
@@ -22,13 +21,14 @@ from morpheyes_daemon.stereo.matching import Match, MatchSettings, disparity_ran
 from morpheyes_daemon.stereo.rectify import Rectification, Rectifier
 from morpheyes_daemon.stereo.rig import RigModel
 
-TALL_PX = 400
-"""Image height from which every second row is enough: 640x480 so matched is still better than 320x240 in full."""
+ROW_STEP_MIN_HEIGHT_PX = 400
+"""Image height in pixels from which rows are matched two by two; chosen: half the time at 640x480, which is still
+more accurate than 320x240 in full (tests/unit/stereo/test_depth_on_real_images.py)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RectifiedPair:
-    """Both rectified grey images (H, W) uint8 and how they were made."""
+    """Both rectified grey images (H, W) uint8 and their rectification."""
 
     left: Image
     right: Image
@@ -36,7 +36,10 @@ class RectifiedPair:
 
 
 class DepthEstimator:
-    """Stereo frames to depth maps for one rig; `size` (width, height) of the images, None: the rig's own."""
+    """Computes depth maps of stereo frames for one rig; `size` (width, height) of the images, None for the rig's own.
+
+    Raises CalibrationError when the rig cannot be read out at `size`.
+    """
 
     def __init__(
         self,
@@ -50,8 +53,8 @@ class DepthEstimator:
         self.config = config or StereoConfig()
         self.settings = settings or default_settings(self.rig.size[1])
 
-    def turned(self, rig: RigModel) -> DepthEstimator:
-        """Return an estimator for the same rig with an eye turned, at the size of the images."""
+    def with_rig(self, rig: RigModel) -> DepthEstimator:
+        """Return an estimator of the same settings for a corrected rig at the size of the images."""
         return DepthEstimator(rig, self.config, settings=self.settings)
 
     @property
@@ -60,11 +63,14 @@ class DepthEstimator:
         return self.rectifier.rig
 
     def estimate(self, frame: StereoFrame, near_m: float | None = None) -> DepthMap:
-        """Return the depth map of a raw frame; see `rectified` and `depth`, which it runs one after the other."""
+        """Return the depth map of a raw frame: `rectified`, then `depth`."""
         return self.depth(frame, self.rectified(frame), near_m)
 
     def rectified(self, frame: StereoFrame) -> RectifiedPair:
-        """Return the rectified grey pair. Raises InputError on a wrong size, CalibrationError outside the range."""
+        """Return the rectified grey pair of a raw frame.
+
+        Raises InputError on a wrong image size, CalibrationError outside the calibrated range.
+        """
         left, right = grey(frame.left), grey(frame.right)
         width, height = self.rig.size
         if left.shape != (height, width) or right.shape != (height, width):
@@ -78,8 +84,8 @@ class DepthEstimator:
     def depth(self, frame: StereoFrame, pair: RectifiedPair, near_m: float | None = None) -> DepthMap:
         """Return the depth map of a rectified pair.
 
-        `near_m` searches only as far as needed to see that near (paper-notes 10); None takes the configured share of
-        the image width.
+        `near_m` limits the search to the disparity of that depth (paper-notes 10); None searches the configured share
+        of the image width.
         """
         rectification = pair.rectification
         baseline_m = self.rig.length_m(frame.baseline.baseline_m)
@@ -89,8 +95,7 @@ class DepthEstimator:
             pair.right,
             count,
             self.settings,
-            left_seen=rectification.cam0.seen,
-            right_seen=rectification.cam1.seen,
+            covered=(rectification.cam0.covered, rectification.cam1.covered),
         )
         return self._depth_map(frame, rectification, found, baseline_m)
 
@@ -122,14 +127,14 @@ class DepthEstimator:
 
 
 def default_settings(height: int) -> MatchSettings:
-    """Return how to match in flight: from TALL_PX rows on they are taken two by two, for half the time."""
-    return MatchSettings(row_step=2 if height >= TALL_PX else 1)
+    """Return the settings in flight: from ROW_STEP_MIN_HEIGHT_PX rows on, rows are matched two by two."""
+    return MatchSettings(row_step=2 if height >= ROW_STEP_MIN_HEIGHT_PX else 1)
 
 
 def depth_from_disparity(disparity_px: FloatMap, baseline_m: float, f_px: float, doffs_px: float = 0.0) -> FloatMap:
     """Return Z = b f / (d + doffs) (H, W) float32 metres, NaN where the disparity is unknown or Z is not finite.
 
-    `doffs_px` is the difference of the principal points where a data set did not make them equal.
+    `doffs_px` is the difference of the principal points, x right - x left, as Middlebury data sets define it.
     """
     total = disparity_px + np.float32(doffs_px)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -137,12 +142,12 @@ def depth_from_disparity(disparity_px: FloatMap, baseline_m: float, f_px: float,
 
 
 def disparity_of(depth: DepthMap) -> FloatMap:
-    """Return the disparity (H, W) float32 pixels that a depth map came from, NaN where it is unknown."""
+    """Return the disparity (H, W) float32 pixels of a depth map, NaN where unknown: d = b f / Z."""
     return np.asarray(np.float32(depth.baseline_m * depth.pinhole.f_px) / depth.depth_m, np.float32)
 
 
 def near_limit_m(baseline_m: float, f_px: float, ceiling_px: float, doffs_px: float = 0.0) -> float:
-    """Return Z_min = b f / numDisparities, nearer than which nothing has a depth (paper-notes 11)."""
+    """Return the near limit Z_min = b f / (largest disparity + doffs), metres (paper-notes 11)."""
     return baseline_m * f_px / (ceiling_px + doffs_px)
 
 
@@ -168,10 +173,10 @@ def depth_sigma(
     baseline_sigma_m: float = 0.0,
     yaw_sigma_rad: float = 0.0,
 ) -> float | NDArray[Any]:
-    """Return one sigma of a depth, metres: eps_z = z^2 eps_d / (b f) (paper, section II) and what else moves it.
+    """Return one sigma of a depth (any shape), metres: eps_z = z^2 eps_d / (b f) (paper, section II) and further terms.
 
-    A baseline wrong by a share moves the depth by that share; a yaw between the eyes moves the disparity by f per
-    radian. The three are independent and added in squares.
+    A relative error of the baseline causes the same relative error of depth; a yaw between the cameras moves the
+    disparity by f per radian. The three are independent and added in squares.
     """
     error_px = math.hypot(sigma_disparity_px, f_px * yaw_sigma_rad)
     relative = np.hypot(depth_m * (error_px / (baseline_m * f_px)), baseline_sigma_m / baseline_m)
@@ -179,5 +184,5 @@ def depth_sigma(
 
 
 def grey(image: Image) -> Image:
-    """Return an image (H, W) or BGR (H, W, 3) as grey (H, W)."""
+    """Return an image (H, W) or BGR (H, W, 3) uint8 as grey (H, W) uint8."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""Pictures from files to depth and back to files: what `morpheyes depth` reads and leaves behind."""
+"""Files of `morpheyes depth`: reads image pairs, writes depth maps and their figure."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.stereo.colours import UNKNOWN_BGR, colour_depth
 from morpheyes_daemon.stereo.still import StillDepth, halves
 
-NEAR_BGR, ONE_EYED_BGR = (235, 235, 235), (96, 84, 78)
+NEAR_BGR, HALF_OCCLUDED_BGR = (235, 235, 235), (96, 84, 78)
 INK, GREY = "#30343a", "#888888"
 WIDTH_IN, DPI = 9.0, 150
+"""Colours of the figure, its width in inches and its dots per inch; chosen: readable in print and on screen."""
 
 
 def read_pair(left: Path, right: Path | None) -> tuple[Image, Image]:
@@ -42,7 +43,7 @@ def read_picture(path: Path) -> Image:
 
 
 def write_depth(out: Path, depth: StillDepth, title: str) -> list[Path]:
-    """Write depth.npy and depth.png into `out` and return their paths; raises InputError when that cannot be."""
+    """Write depth.npy and depth.png into `out` and return their paths; raises InputError when they cannot be written."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         np.save(out / "depth.npy", depth.depth_m)
@@ -53,7 +54,7 @@ def write_depth(out: Path, depth: StillDepth, title: str) -> list[Path]:
 
 
 def draw_depth(path: Path, depth: StillDepth, title: str) -> None:
-    """Write the picture and its depth side by side, with a colour bar in metres and a legend for what is unknown."""
+    """Write the left image and its depth side by side, with a colour bar in metres and a legend of unknown pixels."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
@@ -72,7 +73,7 @@ def draw_depth(path: Path, depth: StillDepth, title: str) -> None:
     shares = [
         (UNKNOWN_BGR, "unknown", np.isnan(depth.depth_m) & ~depth.near & ~depth.half_occluded),
         (NEAR_BGR, f"nearer than {depth.near_limit_m:.2f} m", depth.near),
-        (ONE_EYED_BGR, "only the left eye sees it", depth.half_occluded),
+        (HALF_OCCLUDED_BGR, "half-occluded (left camera only)", depth.half_occluded),
     ]
     handles = [
         Patch(facecolor=_hex(bgr), edgecolor=GREY, label=f"{label} ({100 * mask.mean():.1f} %)")
@@ -83,7 +84,7 @@ def draw_depth(path: Path, depth: StillDepth, title: str) -> None:
 
 
 def _range(depth_m: FloatMap) -> tuple[float, float]:
-    """Return the depths at which the colours end: what nearly all of the picture lies between."""
+    """Return the ends of the colour scale, metres: the 0.5 and 99 percentiles of the known depths (H, W)."""
     known = depth_m[np.isfinite(depth_m)]
     if not known.size:
         return 0.5, 30.0
@@ -94,7 +95,7 @@ def _range(depth_m: FloatMap) -> tuple[float, float]:
 def _coloured(depth: StillDepth, near_m: float, far_m: float) -> Image:
     picture = colour_depth(depth.depth_m, near_m, far_m)
     picture[depth.near] = NEAR_BGR
-    picture[depth.half_occluded] = ONE_EYED_BGR
+    picture[depth.half_occluded] = HALF_OCCLUDED_BGR
     return picture
 
 

@@ -1,7 +1,7 @@
 """One camera: pinhole with skew and the paper's radial-tangential distortion, projected and inverted.
 
-OpenCV's camera matrix has no skew, so the formulas (paper, section II) are written here. They know nothing of
-where the camera is; that is the rig's.
+OpenCV's camera matrix has no skew, so the formulas (paper, section II) are written here. Poses are not part of it;
+they belong to the rig.
 """
 
 from __future__ import annotations
@@ -18,8 +18,15 @@ from morpheyes_daemon.transforms import Array
 
 _NEWTON_STEPS = 20
 _NEWTON_TOLERANCE = 1e-13
+"""Most Newton steps and the normalised step that ends them; chosen: double precision of coordinates near 1."""
+_LARGEST_STEP = 0.5
+"""Largest Newton step, normalised; chosen: keeps an iteration from jumping over a fold of the polynomial."""
+_SOLVED = 1e-9
+"""Largest residual of a solution, normalised; chosen: a millionth of a pixel."""
 _ASPECT_TOLERANCE = 0.01
+"""Largest relative difference of the aspect ratios of two image sizes; chosen: rounding of small images."""
 _BORDER_POINTS = 33
+"""Points along each edge of the image; chosen: an edge bends smoothly between them."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +59,7 @@ class CameraIntrinsics:
         return np.array([[self.fx, self.alpha * self.fx, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, p_cam: Array) -> Array:
-        """Return the pixels (..., 2) of points (..., 3) in front of the camera, in its own frame."""
+        """Return the pixels (..., 2) of points (..., 3) in camera axes with z > 0 (paper, section II)."""
         return self.pixels_from_normalised(p_cam[..., :2] / p_cam[..., 2:3])
 
     def pixels_from_normalised(self, xy: Array) -> Array:
@@ -62,18 +69,18 @@ class CameraIntrinsics:
         return np.stack([self.fx * (x + self.alpha * y) + self.cx, self.fy * y + self.cy], axis=-1)
 
     def normalised_from_pixels(self, uv: Array) -> Array:
-        """Return the undistorted normalised coordinates (..., 2) of pixels (..., 2): x = X/Z, y = Y/Z."""
+        """Return the undistorted normalised coordinates (..., 2), x = X/Z, y = Y/Z, of pixels (..., 2)."""
         y = (uv[..., 1] - self.cy) / self.fy
         x = (uv[..., 0] - self.cx) / self.fx - self.alpha * y
         return undistort(np.stack([x, y], axis=-1), self.k)
 
     def rescaled(self, width: int, height: int) -> CameraIntrinsics:
-        """Return the same lens read out at another size of the same shape; raises CalibrationError for another."""
+        """Return the intrinsics at another image size; raises CalibrationError when the aspect ratio differs."""
         sx, sy = width / self.width, height / self.height
         if abs(sx / sy - 1.0) > _ASPECT_TOLERANCE:
             raise CalibrationError(
                 f"The calibration is for {self.width}x{self.height} px and cannot serve {width}x{height} px, "
-                "which has another shape; calibrate at the size that is used."
+                "which has another aspect ratio; calibrate at the size that is used."
             )
         return CameraIntrinsics(
             width,
@@ -88,7 +95,10 @@ class CameraIntrinsics:
 
     @cached_property
     def largest_radius(self) -> float:
-        """Return the undistorted normalised radius up to which the radial distortion grows; inf for most lenses."""
+        """Undistorted normalised radius up to which the radial distortion is monotonic; inf for most lenses.
+
+        Smallest positive root of d/dr (r + k1 r^3 + k2 r^5 + k5 r^7).
+        """
         k1, k2, _, _, k5 = self.k
         roots = np.roots([7 * k5, 5 * k2, 3 * k1, 1.0])
         turning = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
@@ -123,7 +133,7 @@ def distort(xy: Array, k: tuple[float, float, float, float, float]) -> Array:
 def undistort(xy_d: Array, k: tuple[float, float, float, float, float]) -> Array:
     """Return the undistorted coordinates (..., 2) of `xy_d` by Newton's method on `distort`.
 
-    NaN where the model cannot have produced the point: a lens polynomial that folds back before it gets there.
+    NaN outside the range of the model, where its polynomial folds back before it reaches the point.
     """
     if not any(k):
         return np.array(xy_d, dtype=np.float64)
@@ -135,8 +145,8 @@ def undistort(xy_d: Array, k: tuple[float, float, float, float, float]) -> Array
         xy = xy - step
         if np.all(np.abs(step) <= _NEWTON_TOLERANCE):
             break
-    solved = np.abs(distort(xy, k) - target).max(axis=-1, keepdims=True) < 1e-9
-    return np.where(solved & _grows(xy, k)[..., None], xy, np.nan)
+    solved = np.abs(distort(xy, k) - target).max(axis=-1, keepdims=True) < _SOLVED
+    return np.where(solved & _invertible(xy, k)[..., None], xy, np.nan)
 
 
 def _newton_step(xy: Array, target: Array, k: tuple[float, float, float, float, float]) -> Array:
@@ -147,7 +157,7 @@ def _newton_step(xy: Array, target: Array, k: tuple[float, float, float, float, 
     step = np.stack(
         [(d * error[..., 0] - b * error[..., 1]) / det, (a * error[..., 1] - b * error[..., 0]) / det], axis=-1
     )
-    return np.clip(step, -0.5, 0.5)
+    return np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
 
 
 def _jacobian(xy: Array, k: tuple[float, float, float, float, float]) -> tuple[Array, Array, Array]:
@@ -163,7 +173,7 @@ def _jacobian(xy: Array, k: tuple[float, float, float, float, float]) -> tuple[A
     return xx, xy_, yy
 
 
-def _grows(xy: Array, k: tuple[float, float, float, float, float]) -> NDArray[np.bool_]:
-    """Return where distortion has not folded back: its Jacobian is positive definite."""
+def _invertible(xy: Array, k: tuple[float, float, float, float, float]) -> NDArray[np.bool_]:
+    """Return where (...,) the distortion is invertible: its Jacobian is positive definite."""
     xx, xy_, yy = _jacobian(xy, k)
     return np.asarray((xx * yy - xy_ * xy_ > 0) & (xx > 0))

@@ -1,9 +1,9 @@
-"""Dense matching of a rectified pair: disparity, and for what is unknown whether it is near or seen by one eye only.
+"""Dense matching of a rectified pair: disparity, and for unknown pixels whether they are too near or half-occluded.
 
 Semi-global matching is OpenCV's (StereoSGBM, Hirschmüller 2008, three path directions), on images padded so that
-only what the right eye cannot see is lost. What is nearer than the largest disparity has no match at all, and the
-matcher then often invents a far one; so a coarse search over a longer range runs beside it, finds such regions and
-overrules the fine one there. The result does not depend on the number of threads.
+only pixels outside the right image are lost. Objects nearer than the largest disparity have no match, and the matcher
+often finds a false, far one there; so a coarse search over a longer range detects such regions and overrules the
+fine search. The result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -18,25 +18,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import InputError
-from morpheyes_daemon.messages.core import FloatMap, Image
+from morpheyes_daemon.messages.core import FloatMap, Image, Mask
 
-Mask = NDArray[np.bool_]
-
-COARSE_TALL = 2
-"""Coarse pixels are so much taller than wide: half the time, and what is near is tall as well."""
+COARSE_ROW_FACTOR = 2
+"""Height over width of a coarse pixel; chosen: halves the time of the coarse search, loses low obstacles."""
 
 STEP = 16
-"""OpenCV wants the number of disparities to be a multiple of this."""
+"""The number of disparities must be a multiple of this (OpenCV, StereoSGBM)."""
 
 SUBPIXELS = 16
-"""StereoSGBM returns disparities in sixteenths of a pixel."""
+"""Steps per pixel of StereoSGBM's fixed-point disparity (OpenCV, StereoMatcher::DISP_SCALE)."""
+
+CEILING_MARGIN_PX = 1.5
+"""Disparities within this of the largest one count as beyond it: the matcher cannot interpolate there."""
 
 
-def _straightened() -> FloatMap:
-    """Return the true fraction (16,) for each fraction that StereoSGBM gives, relative to its whole pixel.
+def _subpixel_correction() -> FloatMap:
+    """Return the correction (16,) in pixels for each sixteenth that StereoSGBM returns.
 
-    OpenCV fits a parabola to a cost that is a V, which draws x = delta / (2 (1 - delta)) from the true delta towards
-    whole pixels, and its integer division lifts negative fractions by one step. Both are undone.
+    OpenCV fits a parabola to a V-shaped cost, which biases the true fraction delta to x = delta / (2 (1 - delta)),
+    towards whole pixels, and its integer division raises negative fractions by one step. Both are inverted.
     """
     step = np.arange(SUBPIXELS)
     step = np.where(step <= SUBPIXELS // 2, step, step - SUBPIXELS)
@@ -45,35 +46,48 @@ def _straightened() -> FloatMap:
     return np.asarray(true - step / SUBPIXELS, dtype=np.float32)
 
 
-_CORRECTION_PX = _straightened()
+_CORRECTION_PX = _subpixel_correction()
 
 
 @dataclass(frozen=True, slots=True)
 class MatchSettings:
-    """How to match; the penalties are per pixel of the block's area, sizes are pixels of the image matched.
+    """Settings of the matcher; all are chosen, with what each trades.
 
-    `row_step` 2 matches rows averaged two by two: half the time, all of the disparity resolution.
+    Penalties are per pixel of the block's area; `_px` are pixels of the matched image.
     """
 
     block_px: int = 3
+    """Side of the block; larger ones blur thin branches, smaller ones are noisier."""
     small_step_penalty: int = 4
+    """P1 per pixel of the block; larger flattens slanted surfaces."""
     large_step_penalty: int = 16
+    """P2 per pixel of the block; larger bridges depth edges."""
     gradient_cap: int = 63
+    """Grey levels at which the horizontal gradient is truncated."""
     uniqueness_pct: int = 15
+    """Margin in percent of the best cost over the second best; larger loses repetitive texture."""
     left_right_px: int = 1
+    """Largest difference in the left-right check."""
     speckle_per_image: float = 1 / 1200
+    """Patches below this fraction of the image are removed."""
     island_per_image: float = 1 / 400
-    island_shore: float = 0.8
+    """Patches below this fraction are removed where ..."""
+    island_unknown_share: float = 0.8
+    """... more than this share of their neighbours is unknown."""
     row_step: int = 1
+    """2 matches the means of two rows: half the time, the full disparity resolution."""
     coarse_width_px: int = 160
+    """Width of the coarse image that is searched beyond the ceiling."""
     coarse_range: float = 3.0
+    """Range of the coarse search over that of the fine one."""
     coarse_speckle_px: int = 30
+    """Patches of the coarse disparity below this are removed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """disparity_px (H, W) float32, NaN unknown; near: unknown because nearer than `ceiling_px`; half_occluded: unknown
-    because only the left eye sees it."""
+    """disparity_px (H, W) float32, NaN unknown. `near`: unknown since nearer than `ceiling_px` allows; `half_occluded`:
+    unknown since seen by the left camera only; both (H, W) bool."""
 
     disparity_px: FloatMap
     near: Mask
@@ -94,40 +108,44 @@ def match(
     settings: MatchSettings | None = None,
     *,
     min_disparity: int = 0,
-    left_seen: Mask | None = None,
-    right_seen: Mask | None = None,
+    covered: tuple[Mask | None, Mask | None] = (None, None),
 ) -> Match:
-    """Match rectified grey images (H, W) uint8 over [min_disparity, min_disparity + num_disparities).
+    """Return the disparity of rectified grey images (H, W) uint8 over [min_disparity, min_disparity + num_disparities).
 
-    `left_seen` and `right_seen` (H, W) mark the pixels that the eyes really cover. Raises InputError when the images
-    cannot be matched at all.
+    `covered` are the pixels (H, W) of the left and of the right rectified image that the raw images cover, None for
+    all. Raises InputError when sizes or types differ or `num_disparities` does not fit the width. Semi-global matching
+    after Hirschmueller (2008), as OpenCV implements it.
     """
     _require_pair(left, right, num_disparities)
     settings = settings or MatchSettings()
     shape, step = left.shape, settings.row_step
     ceiling = min_disparity + num_disparities
-    near = _too_near(left, right, min_disparity, num_disparities, settings)[::step][: shape[0] // step]
+    near = _beyond_ceiling(left, right, min_disparity, num_disparities, settings)[::step][: shape[0] // step]
     if step > 1:
-        left, right = _shrunk(left, 1, step), _shrunk(right, 1, step)
+        left, right = _downsampled(left, 1, step), _downsampled(right, 1, step)
     speckle_px = round(left.size * settings.speckle_per_image)
-    disparity = semi_global(left, right, min_disparity, num_disparities, settings, speckle_px)
-    near |= disparity > ceiling - 1.5
+    disparity = semi_global(left, right, range(min_disparity, ceiling), settings, speckle_px)
+    near |= disparity > ceiling - CEILING_MARGIN_PX
     disparity[near] = np.nan
-    left_seen, right_seen = (_rows_of(seen, step) for seen in (left_seen, right_seen))
-    _forget_unseen(disparity, near, left_seen, right_seen)
-    _forget_islands(disparity, round(left.size * settings.island_per_image), settings.island_shore)
+    _remove_uncovered(disparity, near, _rows_of(covered[0], step), _rows_of(covered[1], step))
+    _remove_islands(disparity, round(left.size * settings.island_per_image), settings.island_unknown_share)
     half_occluded = _half_occluded(disparity, near, ceiling)
     if step > 1:
-        disparity, near, half_occluded = (_grown(array, 1, step, shape) for array in (disparity, near, half_occluded))
+        disparity, near, half_occluded = (
+            _upsampled(array, 1, step, shape) for array in (disparity, near, half_occluded)
+        )
     return Match(disparity, near, half_occluded, float(ceiling))
 
 
-def semi_global(left: Image, right: Image, low: int, count: int, settings: MatchSettings, speckle_px: int) -> FloatMap:
-    """Return the disparity (H, W) float32 of left pixels, NaN where unknown or outside the right image."""
+def semi_global(left: Image, right: Image, search: range, settings: MatchSettings, speckle_px: int) -> FloatMap:
+    """Return the disparity (H, W) float32 of left pixels, NaN where unknown or outside the right image.
+
+    `search` are the disparities in pixels; patches below `speckle_px` pixels are removed (OpenCV, StereoSGBM).
+    """
     block_area = settings.block_px**2
     matcher = cv2.StereoSGBM.create(
-        minDisparity=low,
-        numDisparities=count,
+        minDisparity=search.start,
+        numDisparities=len(search),
         blockSize=settings.block_px,
         P1=settings.small_step_penalty * block_area,
         P2=settings.large_step_penalty * block_area,
@@ -138,35 +156,36 @@ def semi_global(left: Image, right: Image, low: int, count: int, settings: Match
         speckleRange=1,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    before, after = max(0, low + count), max(0, -low)
-    padded = [cv2.copyMakeBorder(eye, 0, 0, before, after, cv2.BORDER_REPLICATE) for eye in (left, right)]
+    before, after = max(0, search.stop), max(0, -search.start)
+    padded = [cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE) for image in (left, right)]
     fixed = np.asarray(matcher.compute(*padded), dtype=np.int16)[:, before : before + left.shape[1]]
     disparity = fixed.astype(np.float32) / np.float32(SUBPIXELS) + _CORRECTION_PX[fixed & (SUBPIXELS - 1)]
     column = np.arange(left.shape[1], dtype=np.float32)
-    disparity[(fixed < low * SUBPIXELS) | (disparity > column + 0.5)] = np.nan
+    disparity[(fixed < search.start * SUBPIXELS) | (disparity > column + 0.5)] = np.nan
     return np.asarray(disparity)
 
 
-def _too_near(left: Image, right: Image, low: int, count: int, settings: MatchSettings) -> Mask:
-    """Return where a coarse search over a longer range prefers a disparity beyond the fine search's ceiling."""
+def _beyond_ceiling(left: Image, right: Image, low: int, count: int, settings: MatchSettings) -> Mask:
+    """Return the pixels (H, W) whose coarse match, over a longer range, lies beyond the ceiling of the fine search."""
     height, width = left.shape
     scale = max(1, round(width / settings.coarse_width_px))
-    small_left, small_right = (_shrunk(eye, scale, COARSE_TALL * scale) for eye in (left, right))
+    small_left, small_right = (_downsampled(image, scale, COARSE_ROW_FACTOR * scale) for image in (left, right))
     reach = disparity_range(count * settings.coarse_range / scale, small_left.shape[1])
-    coarse = semi_global(small_left, small_right, low // scale, reach, settings, settings.coarse_speckle_px)
+    search = range(low // scale, low // scale + reach)
+    coarse = semi_global(small_left, small_right, search, settings, settings.coarse_speckle_px)
     beyond = coarse * scale > low + count + scale / 2
-    return _grown(beyond, scale, COARSE_TALL * scale, (height, width))
+    return _upsampled(beyond, scale, COARSE_ROW_FACTOR * scale, (height, width))
 
 
-def _shrunk(image: Image, across: int, down: int) -> Image:
+def _downsampled(image: Image, across: int, down: int) -> Image:
     height, width = image.shape
     rows, columns = height // down, width // across
     cut = image[: rows * down, : columns * across]
     return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
-def _grown(small: NDArray[Any], across: int, down: int, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return `small` with every pixel repeated; what is left over at the right and bottom repeats the edge."""
+def _upsampled(small: NDArray[Any], across: int, down: int, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return `small` with every pixel repeated, and its right and bottom edge extended to `shape`."""
     drawn = small.view(np.uint8) if small.dtype == np.bool_ else small
     size = (small.shape[1] * across, small.shape[0] * down)
     grown = cv2.resize(drawn, size, interpolation=cv2.INTER_NEAREST)
@@ -175,28 +194,29 @@ def _grown(small: NDArray[Any], across: int, down: int, shape: tuple[int, ...]) 
     return whole.view(np.bool_) if small.dtype == np.bool_ else whole
 
 
-def _rows_of(seen: Mask | None, step: int) -> Mask | None:
-    return None if seen is None else seen[::step][: seen.shape[0] // step]
+def _rows_of(covered: Mask | None, step: int) -> Mask | None:
+    return None if covered is None else covered[::step][: covered.shape[0] // step]
 
 
-def _forget_unseen(disparity: FloatMap, near: Mask, left_seen: Mask | None, right_seen: Mask | None) -> None:
-    if left_seen is not None:
-        disparity[~left_seen] = np.nan
-        near &= left_seen
-    if right_seen is not None:
-        # what an eye sees of a rectified row is one piece
-        width = right_seen.shape[1]
-        first = right_seen.argmax(axis=1)
-        last = np.where(right_seen.any(axis=1), width - 1 - right_seen[:, ::-1].argmax(axis=1), -1)
+def _remove_uncovered(disparity: FloatMap, near: Mask, left: Mask | None, right: Mask | None) -> None:
+    """Make pixels unknown that are outside the left raw image, or whose match is outside the right one."""
+    if left is not None:
+        disparity[~left] = np.nan
+        near &= left
+    if right is not None:
+        # the covered part of a rectified row is connected
+        width = right.shape[1]
+        first = right.argmax(axis=1)
+        last = np.where(right.any(axis=1), width - 1 - right[:, ::-1].argmax(axis=1), -1)
         partner = np.arange(width, dtype=np.float32) - disparity
         disparity[(partner < first[:, None] - 0.5) | (partner > last[:, None] + 0.5)] = np.nan
 
 
-def _forget_islands(disparity: FloatMap, largest_px: int, shore: float) -> None:
-    """Forget small patches of disparity in a sea of unknown: where nothing can match, something always seems to.
+def _remove_islands(disparity: FloatMap, largest_px: int, unknown_share: float) -> None:
+    """Make small patches of disparity unknown that are surrounded by unknown pixels: false matches of textureless areas.
 
-    A patch goes when more than the share `shore` of its neighbours is unknown; a thin branch stays, since on one side
-    of it lies what it does not hide.
+    A patch is removed when more than `unknown_share` of its neighbours are unknown; a thin branch stays, since the
+    background is known on one side of it.
     """
     none = np.iinfo(np.int16).min
     unknown = np.isnan(disparity)
@@ -204,17 +224,17 @@ def _forget_islands(disparity: FloatMap, largest_px: int, shore: float) -> None:
     large = fixed.copy()
     cv2.filterSpeckles(large, none, largest_px, SUBPIXELS)
     count, labels = cv2.connectedComponents((fixed != large).view(np.uint8), connectivity=4)
-    around, sea = np.zeros(count), np.zeros(count)
-    for patch, beside, water in _neighbours(labels, unknown):
+    total, unknown_count = np.zeros(count), np.zeros(count)
+    for patch, beside, beside_unknown in _neighbours(labels, unknown):
         edge = (patch != beside) & (patch > 0)
-        around += np.bincount(patch[edge], minlength=count)
-        sea += np.bincount(patch[edge], weights=water[edge], minlength=count)
-    drowned = sea > shore * around
-    disparity[drowned[labels]] = np.nan
+        total += np.bincount(patch[edge], minlength=count)
+        unknown_count += np.bincount(patch[edge], weights=beside_unknown[edge], minlength=count)
+    isolated = unknown_count > unknown_share * total
+    disparity[isolated[labels]] = np.nan
 
 
 def _neighbours(labels: NDArray[Any], unknown: Mask) -> Iterator[tuple[NDArray[Any], NDArray[Any], Mask]]:
-    """Yield labels, the labels on one side of them, and whether that side is unknown, for the four sides."""
+    """Yield labels, the labels of the neighbours on one side, and whether these are unknown, for the four sides."""
     yield labels[:, :-1], labels[:, 1:], unknown[:, 1:]
     yield labels[:, 1:], labels[:, :-1], unknown[:, :-1]
     yield labels[:-1], labels[1:], unknown[1:]
@@ -222,11 +242,11 @@ def _neighbours(labels: NDArray[Any], unknown: Mask) -> Iterator[tuple[NDArray[A
 
 
 def _half_occluded(disparity: FloatMap, near: Mask, ceiling: float) -> Mask:
-    """Return where something nearer hides an unknown pixel from the right eye, or the image's edge does.
+    """Return where an unknown pixel is hidden from the right camera by a nearer surface or by the edge of the image.
 
-    Seen from the right eye a nearer surface with disparity d_f covers d_f - d_b pixels of the background (d_b) left
-    of its own left edge; at the image's edge d_f pixels are missing. What lies left of something too near may well
-    belong to it, so nothing is said about that.
+    Seen from the right camera a nearer surface with disparity d_f covers d_f - d_b pixels of the background (d_b) left
+    of its own left edge; at the image's edge d_f pixels are missing. Pixels left of a region nearer than the ceiling may
+    belong to it and are not marked.
     """
     height, width = disparity.shape
     row, first, end = _runs(np.isnan(disparity) & ~near)
@@ -244,7 +264,7 @@ def _half_occluded(disparity: FloatMap, near: Mask, ceiling: float) -> Mask:
 
 
 def _runs(mask: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Return row, first column and end column (one past the last) of every unbroken run of True along a row."""
+    """Return row, first column and end column (one past the last) (n,) of every run of True along a row of (H, W)."""
     width = mask.shape[1] + 2
     framed = np.pad(mask, ((0, 0), (1, 1))).ravel()
     edges = np.flatnonzero(framed[1:] != framed[:-1]) + 1

@@ -1,8 +1,8 @@
-"""Rectification for a baseline that changes all the time: parallel eyes, common camera matrix, rows that align.
+"""Rectification at any baseline: rotates both cameras parallel and gives them a common camera matrix.
 
-R_rect follows the paper (section II); both eyes are re-projected with one common K_rect, without which rows would
-not align when the lenses differ. Maps are computed on a coarse grid in double precision and spread linearly, which
-stays within 0.01 px and makes a new baseline cheap. Nothing here looks at what the images show.
+R_rect follows the paper (section II); without one common K_rect rows would not align when the lenses differ. Maps
+are computed on a coarse grid in double precision and interpolated linearly, which stays within 0.01 px (tested in
+tests/unit/stereo/test_rectify.py) and makes a new baseline cheap. The content of the images is not used.
 """
 
 from __future__ import annotations
@@ -12,41 +12,41 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import CalibrationError
-from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole, frozen
+from morpheyes_daemon.messages.core import FloatMap, Image, Mask, Pinhole, frozen
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import Array, inverse, pose
 
 WIDE_GRID_PX, NARROW_GRID_PX, WIDE_FROM_PX = 8, 4, 480
-"""Steps of the coarse grid; a lens with k1 = -0.3 and a 47 degree view bends by less than 0.01 px within one."""
+"""Steps of the coarse grid for wide and narrow images, and the width that separates them, pixels; chosen: within one
+step a lens with k1 = -0.3 and a 47 degree view deviates from linear by less than 0.01 px."""
 
 QUANTUM_M = 0.25e-3
-"""Baselines nearer than this share their maps: the pose between the eyes does not change visibly over it."""
+"""Baselines within one quantum share their maps, metres; chosen: smaller ones compute maps more often while moving."""
 
 CACHED = 8
-"""Rectifications kept; one at 640x480 takes 5 MB."""
+"""Rectifications kept; chosen: 5 MB each at 640x480 (two maps of 2 x float32)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RectifiedEye:
-    """How one eye's raw image becomes the rectified one.
+class RectifiedCamera:
+    """Rectifying map of one camera.
 
-    `map_px` (H, W, 2) float32 gives the raw pixel of every rectified one; `seen` (H, W) bool is False where the raw
-    image does not reach, None where it reaches everywhere.
+    `R_rect_cam` (3, 3); `map_px` (H, W, 2) float32 is the raw pixel of every rectified one; `covered` (H, W) bool is
+    False outside the raw image, None where the raw image covers everything.
     """
 
     intrinsics: CameraIntrinsics
     R_rect_cam: Array
     pinhole: Pinhole
     map_px: FloatMap
-    seen: NDArray[np.bool_] | None
+    covered: Mask | None
 
     def image(self, raw: Image) -> Image:
         """Return the rectified image (H, W) or (H, W, 3) of a raw one."""
-        # the second map must be None: OpenCV 5 makes rubbish of an empty array there
+        # the second map must be None: OpenCV 5 returns a wrong image for an empty array
         return np.asarray(
             cv2.remap(  # type: ignore[call-overload]
                 raw, self.map_px, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -55,34 +55,34 @@ class RectifiedEye:
         )
 
     def points(self, uv: Array) -> Array:
-        """Return the rectified pixels (..., 2) of raw ones, exactly; NaN where the lens cannot see."""
+        """Return the rectified pixels (..., 2) of raw ones (..., 2), exactly; NaN outside the lens model."""
         rays = homogeneous(self.intrinsics.normalised_from_pixels(uv)) @ self.R_rect_cam.T
         return pixels(self.pinhole, rays)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectification:
-    """Both eyes rectified for one baseline. `baseline_m` is the true length at the nominal one."""
+    """Both cameras rectified for one baseline. `baseline_m` is the true length at the nominal one."""
 
     nominal_m: float
     baseline_m: float
     pinhole: Pinhole
-    cam0: RectifiedEye
-    cam1: RectifiedEye
+    cam0: RectifiedCamera
+    cam1: RectifiedCamera
     T_rig_rect: Array
 
     @property
     def R_rect_cam0(self) -> Array:
-        """Rotation from the left camera to the rectified frame: the paper's R_rect."""
+        """Rotation (3, 3) from the left camera to the rectified frame: the paper's R_rect."""
         return self.cam0.R_rect_cam
 
     def pair(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Return the rectified left and right images."""
+        """Return the rectified images (H, W) or (H, W, 3) of a raw pair."""
         return self.cam0.image(left), self.cam1.image(right)
 
 
 class Rectifier:
-    """Makes and keeps rectifications of one rig at one image size, (width, height) in pixels."""
+    """Computes and caches the rectifications of one rig at one image size, (width, height) in pixels."""
 
     def __init__(self, rig: RigModel, size: tuple[int, int] | None = None) -> None:
         self.rig = rig.rescaled(*size) if size is not None else rig
@@ -104,7 +104,7 @@ class Rectifier:
 
 
 def rectify(rig: RigModel, baseline_m: float) -> Rectification:
-    """Return the rectification of `rig` at a nominal baseline, computed afresh."""
+    """Return the rectification of `rig` at a nominal baseline, not cached; raises CalibrationError outside its range."""
     T_cam0_cam1 = rig.T_cam0_cam1(baseline_m)
     R_rect_cam0 = rectifying_rotation(T_cam0_cam1[:3, 3])
     R_rect_cam1 = R_rect_cam0 @ T_cam0_cam1[:3, :3]
@@ -115,14 +115,14 @@ def rectify(rig: RigModel, baseline_m: float) -> Rectification:
         nominal_m=baseline_m,
         baseline_m=length_m,
         pinhole=pinhole,
-        cam0=_rectified_eye(rig.cam0, R_rect_cam0, pinhole),
-        cam1=_rectified_eye(rig.cam1, R_rect_cam1, pinhole),
+        cam0=_rectified_camera(rig.cam0, R_rect_cam0, pinhole),
+        cam1=_rectified_camera(rig.cam1, R_rect_cam1, pinhole),
         T_rig_rect=frozen(T_rig_cam0 @ inverse(pose(R_rect_cam0, np.zeros(3)))),
     )
 
 
 def rectifying_rotation(t_cam0_cam1: Array) -> Array:
-    """Return R_rect (3, 3), the left camera to the rectified frame (paper, section II, equations of R_rect).
+    """Return R_rect_cam0 (3, 3) of the translation (3,) (paper, section II, equations of R_rect).
 
     Its rows are r_x along the baseline, r_z the part of the left optical axis normal to it, r_y = r_z x r_x.
     """
@@ -134,7 +134,10 @@ def rectifying_rotation(t_cam0_cam1: Array) -> Array:
 
 
 def common_pinhole(rig: RigModel, R_rect_cam0: Array, R_rect_cam1: Array) -> Pinhole:
-    """Return K_rect: the mean focal length, and the middle of what both eyes see in the middle of the image."""
+    """Return K_rect: the mean focal length, and the principal point that centres the common field of view.
+
+    `R_rect_cam0` and `R_rect_cam1` (3, 3). Raises CalibrationError when the cameras have no common view.
+    """
     width, height = rig.size
     f_px = (rig.cam0.fx + rig.cam0.fy + rig.cam1.fx + rig.cam1.fy) / 4
     views = np.stack([_view(rig.cam0, R_rect_cam0), _view(rig.cam1, R_rect_cam1)])
@@ -149,13 +152,13 @@ def homogeneous(xy: Array) -> Array:
 
 
 def pixels(pinhole: Pinhole, p_rect: Array) -> Array:
-    """Return the pixels (..., 2) of points (..., 3) in the rectified frame."""
+    """Return the rectified pixels (..., 2) of points (..., 3) in rect axes."""
     xy = p_rect[..., :2] / p_rect[..., 2:3]
     return np.asarray(pinhole.f_px * xy + np.array([pinhole.cx_px, pinhole.cy_px]))
 
 
 def rays(pinhole: Pinhole, uv: Array) -> Array:
-    """Return rays (..., 3) with z = 1 in the rectified frame of rectified pixels (..., 2)."""
+    """Return the rays (..., 3), z = 1, in rect axes, of rectified pixels (..., 2)."""
     return homogeneous((uv - np.array([pinhole.cx_px, pinhole.cy_px])) / pinhole.f_px)
 
 
@@ -165,7 +168,7 @@ def grid_step(width: int) -> int:
 
 
 def grid_pixels(width: int, height: int) -> Array:
-    """Return the pixels (h, w, 2) at the middles of the cells that cover the image and one cell around it."""
+    """Return the pixels (h, w, 2) at the centres of the cells that cover the image and one cell around it."""
     step = grid_step(width)
     u = (np.arange(-1, -(-width // step) + 1) + 0.5) * step - 0.5
     v = (np.arange(-1, -(-height // step) + 1) + 0.5) * step - 0.5
@@ -173,26 +176,26 @@ def grid_pixels(width: int, height: int) -> Array:
 
 
 def _view(camera: CameraIntrinsics, R_rect_cam: Array) -> Array:
-    """Return the corners (2, 2), min and max of x and y, of what a camera sees in the rectified frame."""
+    """Return minimum and maximum (2, 2) of the normalised coordinates x, y that a camera covers in rect axes."""
     xy = camera.normalised_border
     if len(xy) < 4:
         raise CalibrationError("The lens distortion folds back within the image; calibrate the camera again.")
     turned = homogeneous(xy) @ R_rect_cam.T
     if np.any(turned[:, 2] <= 0.1):
-        raise CalibrationError("The eyes point so far apart that no common view is left; calibrate the rig again.")
+        raise CalibrationError("The cameras diverge so far that they have no common view; calibrate the rig again.")
     turned = turned[:, :2] / turned[:, 2:]
     return np.stack([turned.min(axis=0), turned.max(axis=0)])
 
 
-def _rectified_eye(camera: CameraIntrinsics, R_rect_cam: Array, pinhole: Pinhole) -> RectifiedEye:
+def _rectified_camera(camera: CameraIntrinsics, R_rect_cam: Array, pinhole: Pinhole) -> RectifiedCamera:
     raw, inset = _coarse_map(camera, R_rect_cam, pinhole)
     map_px = _spread(raw, pinhole)
-    seen = None if inset.min() >= 0 else frozen(_spread(inset, pinhole) >= 0)
-    return RectifiedEye(camera, frozen(R_rect_cam.copy()), pinhole, frozen(map_px), seen)
+    covered = None if inset.min() >= 0 else frozen(_spread(inset, pinhole) >= 0)
+    return RectifiedCamera(camera, frozen(R_rect_cam.copy()), pinhole, frozen(map_px), covered)
 
 
 def _coarse_map(camera: CameraIntrinsics, R_rect_cam: Array, pinhole: Pinhole) -> tuple[FloatMap, FloatMap]:
-    """Return on the coarse grid the raw pixels (h, w, 2), and how far (h, w) they lie within the raw image."""
+    """Return on the coarse grid the raw pixels (h, w, 2) and their distance (h, w) inside the raw image's border."""
     rays_cam = rays(pinhole, grid_pixels(pinhole.width, pinhole.height)) @ R_rect_cam
     xy = rays_cam[..., :2] / rays_cam[..., 2:3]
     raw = camera.pixels_from_normalised(xy)
@@ -203,7 +206,7 @@ def _coarse_map(camera: CameraIntrinsics, R_rect_cam: Array, pinhole: Pinhole) -
 
 
 def _spread(coarse: FloatMap, pinhole: Pinhole) -> FloatMap:
-    """Return a coarse grid linearly interpolated at every pixel (H, W, ...)."""
+    """Return a coarse grid (h, w, ...) interpolated linearly at every pixel (H, W, ...)."""
     step = grid_step(pinhole.width)
     rows, columns = coarse.shape[:2]
     fine = cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)

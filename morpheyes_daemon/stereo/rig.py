@@ -1,9 +1,9 @@
 """The stereo rig whose baseline moves: two cameras, and the pose between them at any baseline.
 
 Poses are known at a few baselines and interpolated by ScLERP between neighbours (paper, section III-B). The
-parameter is the *nominal* baseline, what the servo was told or is modelled to have reached; the true distance
-between the eyes comes out of the pose, so that a servo that is not linear is calibrated out. How the poses were
-found is the calibration's business, how the file looks that of `calibration_file`.
+parameter is the *nominal* baseline: the commanded or modelled position of the servo. The true distance between the
+cameras is the length of the pose's translation, so the calibration includes a non-linear servo. The poses are found
+by `calibration`; the file format is defined by `calibration_file`.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from morpheyes_daemon.transforms import Array, R_from_rotvec, q_from_R
 __all__ = ["CalibratedBaseline", "CameraIntrinsics", "CameraMount", "RigModel"]
 
 RANGE_TOLERANCE_M = 1.5e-3
-"""How far outside the calibrated range a baseline is still served: two servos' backlash and the play at the stops."""
+"""Distance outside the calibrated range up to which poses are extrapolated, metres; chosen: backlash of two servos
+and the play at the stops."""
 
 METHODS = ("solved", "exact")
 
 
 @dataclass(frozen=True)
 class CalibratedBaseline:
-    """Pose between the eyes at one nominal baseline; what the calibration could not tell is None.
+    """Pose between the cameras at one nominal baseline; what the calibration does not state is None.
 
     `q_cam0_cam1` (w, x, y, z) and `t_cam0_cam1_m` take cam1 coordinates to cam0. `sigma_length_m` and
-    `sigma_yaw_rad` are one standard deviation of the solved length and of the yaw between the eyes.
+    `sigma_yaw_rad` are one standard deviation of the solved length and of the yaw between the cameras.
     """
 
     nominal_m: float
@@ -47,7 +48,7 @@ class CalibratedBaseline:
 
     @classmethod
     def from_pose(cls, nominal_m: float, T_cam0_cam1: Array, **measures: float | None) -> CalibratedBaseline:
-        """Build from a pose (4, 4); `measures` are the optional fields."""
+        """Return the baseline of a pose (4, 4); `measures` are the optional fields."""
         w, x, y, z = (float(c) for c in q_from_R(T_cam0_cam1[:3, :3]))
         tx, ty, tz = (float(c) for c in T_cam0_cam1[:3, 3])
         return cls(float(nominal_m), (w, x, y, z), (tx, ty, tz), **measures)
@@ -60,7 +61,7 @@ class CalibratedBaseline:
 
 @dataclass(frozen=True)
 class CameraMount:
-    """How the left eye is turned on the bar: rotation vector R_rig_cam0 and one sigma of it, radians, camera axes."""
+    """Orientation of the left camera on the bar: rotation vector (3,) of R_rig_cam0 with one sigma, rad, camera axes."""
 
     rotation_rad: tuple[float, float, float]
     sigma_rad: tuple[float, float, float]
@@ -68,11 +69,12 @@ class CameraMount:
 
 @dataclass(frozen=True)
 class RigModel:
-    """Intrinsics of both eyes and the pose between them over the calibrated range of baselines.
+    """Intrinsics of both cameras and the pose between them over the calibrated range of baselines.
 
-    `method` is "solved" (from images) or "exact" (known, a simulator's truth). Boards do not tell how the eyes sit on
-    the vehicle: without a `mount` the left one is taken for straight on the bar. `details` is plain data for people
-    and reports: board, date, coverage, uncertainty per parameter; it is kept in the file and not used for geometry.
+    `method` is "solved" (from images) or "exact" (known, a simulator's truth). Boards do not
+    determine the orientation on the vehicle: without a `mount` the left camera is assumed parallel to the bar.
+    `details` is plain data for reports (board, date, coverage, uncertainties); it is stored and not used for geometry.
+    Raises CalibrationError on inconsistent content.
     """
 
     cam0: CameraIntrinsics
@@ -95,7 +97,7 @@ class RigModel:
         for baseline in self.baselines:
             _check(baseline)
         if self.mount is not None and not np.all(np.isfinite([*self.mount.rotation_rad, *self.mount.sigma_rad])):
-            raise CalibrationError("The left eye's rotation on the bar is not finite.")
+            raise CalibrationError("The left camera's rotation on the bar is not finite.")
 
     @classmethod
     def from_poses(
@@ -107,14 +109,14 @@ class RigModel:
         method: str = "exact",
         details: Mapping[str, Any] | None = None,
     ) -> RigModel:
-        """Build from nominal baselines and the poses (4, 4) found at each."""
+        """Return the rig of nominal baselines and their poses (4, 4)."""
         pairs = zip(nominal_m, T_cam0_cam1, strict=True)
         baselines = tuple(CalibratedBaseline.from_pose(nominal, T) for nominal, T in pairs)
         return cls(cam0, cam1, baselines, method, details or {})
 
     @property
     def size(self) -> tuple[int, int]:
-        """Image size (width, height) of both eyes in pixels."""
+        """Image size (width, height) of both cameras in pixels."""
         return self.cam0.width, self.cam0.height
 
     @cached_property
@@ -129,22 +131,25 @@ class RigModel:
 
     @property
     def origin(self) -> str:
-        """How the file came about: its method, or "mounted" where the eyes' mount was measured as well."""
+        """Origin of the calibration: its method, or "mounted" where the mount was measured as well."""
         return self.method if self.mount is None else "mounted"
 
     @property
     def R_rig_cam0(self) -> Array:
-        """The left eye's rotation (3, 3) on the bar; none where it was not measured."""
+        """Rotation (3, 3) of the left camera on the bar; the identity where it was not measured."""
         return np.eye(3) if self.mount is None else R_from_rotvec(np.array(self.mount.rotation_rad))
 
     def T_cam0_cam1(self, baseline_m: float) -> Array:
-        """Return the pose (4, 4) of the right eye in the left at a nominal baseline; see `dual_quaternion`."""
+        """Return the pose (4, 4) of the right camera in the left one at a nominal baseline.
+
+        Raises CalibrationError outside the calibrated range; see `dual_quaternion`.
+        """
         return pose_from_dual_quaternion(self.dual_quaternion(baseline_m))
 
     def dual_quaternion(self, baseline_m: float) -> Array:
         """Return T_cam0_cam1 as a unit dual quaternion (8,), by ScLERP between the calibrated neighbours.
 
-        Raises CalibrationError outside the calibrated range.
+        Raises CalibrationError outside the calibrated range (paper, section III-B).
         """
         self._require(baseline_m)
         if len(self.baselines) == 1:
@@ -153,19 +158,19 @@ class RigModel:
         return sclerp(self.baselines[i].dual_quaternion, self.baselines[i + 1].dual_quaternion, t)
 
     def length_m(self, baseline_m: float) -> float:
-        """Return the true distance between the eyes at a nominal baseline."""
+        """Return the true baseline at a nominal one; raises CalibrationError outside the calibrated range."""
         return float(np.linalg.norm(self.T_cam0_cam1(baseline_m)[:3, 3]))
 
     def sigma_length_m(self, baseline_m: float) -> float:
-        """Return the calibration's own sigma of the length at a nominal baseline, 0 where it does not state one."""
+        """Return the stated sigma of the true baseline, metres, at a nominal one; 0 where none is stated."""
         return self._interpolated([b.sigma_length_m for b in self.baselines], baseline_m)
 
     def sigma_yaw_rad(self, baseline_m: float) -> float:
-        """Return the calibration's own sigma of the yaw between the eyes, 0 where it does not state one."""
+        """Return the stated sigma of the yaw between the cameras, rad, at a nominal baseline; 0 where none is stated."""
         return self._interpolated([b.sigma_yaw_rad for b in self.baselines], baseline_m)
 
     def rescaled(self, width: int, height: int) -> RigModel:
-        """Return the same rig read out at another image size of the same shape; raises CalibrationError."""
+        """Return the rig at another image size; raises CalibrationError when the aspect ratio differs."""
         if (width, height) == self.size:
             return self
         cam0, cam1 = self.cam0.rescaled(width, height), self.cam1.rescaled(width, height)
@@ -197,4 +202,6 @@ def _check(baseline: CalibratedBaseline) -> None:
     if abs(np.linalg.norm(baseline.q_cam0_cam1) - 1.0) > 1e-6:
         raise CalibrationError(f"{name} has a rotation that is no unit quaternion.")
     if baseline.t_cam0_cam1_m[0] <= 0:
-        raise CalibrationError(f"{name} puts the right eye left of the left one; were the images swapped?")
+        raise CalibrationError(
+            f"{name} has the right camera left of the left one: exchange the left and right images and solve again."
+        )

@@ -1,8 +1,9 @@
 """Rigid motions as unit dual quaternions, and screw linear interpolation (ScLERP) between them.
 
 A dual quaternion is a float64 array (8,): real part (w, x, y, z), dual part (w, x, y, z), with
-dual = t * real / 2. Interpolation goes through the logarithm, written so that nothing is divided by a vanishing
-angle; up to a half turn it stays stable. The paper (section III-B) uses it between calibrated baselines.
+dual = t * real / 2. Interpolation uses the logarithm (Kavan et al., "Geometric skinning with approximate dual
+quaternion blending", 2008), with series for small angles; it is stable up to a rotation of pi. The paper (section
+III-B) uses it between calibrated baselines.
 """
 
 from __future__ import annotations
@@ -11,21 +12,16 @@ import math
 
 import numpy as np
 
-from morpheyes_daemon.transforms import Array, R_from_q, pose, q_from_R
+from morpheyes_daemon.transforms import Array, R_from_q, pose
 
 _SERIES_BELOW_RAD = 1e-2
-"""Half angles under which series replace the closed forms; the terms left out are below 1e-17 there."""
+"""Half angle, rad, below which series replace the closed forms; the omitted terms, are below 1e-17."""
 
 
 def dual_quaternion(q: Array, t_m: Array) -> Array:
     """Return the unit dual quaternion (8,) of rotation q (4,), which is normalised here, and translation t (3,)."""
     real = np.asarray(q, dtype=np.float64) / np.linalg.norm(q)
     return np.concatenate([real, 0.5 * _multiply_q(np.concatenate([[0.0], t_m]), real)])
-
-
-def dual_quaternion_from_pose(T: Array) -> Array:
-    """Return the unit dual quaternion (8,) of a pose (4, 4)."""
-    return dual_quaternion(q_from_R(T[:3, :3]), T[:3, 3])
 
 
 def pose_from_dual_quaternion(dq: Array) -> Array:
@@ -35,20 +31,20 @@ def pose_from_dual_quaternion(dq: Array) -> Array:
 
 
 def multiply(a: Array, b: Array) -> Array:
-    """Return the product of two dual quaternions: first b, then a, like matrices."""
+    """Return the product (8,) of two dual quaternions (8,): the motion b followed by a, as with matrices."""
     real = _multiply_q(a[:4], b[:4])
     return np.concatenate([real, _multiply_q(a[:4], b[4:]) + _multiply_q(a[4:], b[:4])])
 
 
 def inverse(dq: Array) -> Array:
-    """Return the inverse of a unit dual quaternion."""
+    """Return the inverse (8,) of a unit dual quaternion (8,)."""
     return np.concatenate([_conjugate_q(dq[:4]), _conjugate_q(dq[4:])])
 
 
 def sclerp(a: Array, b: Array, t: float) -> Array:
-    """Return a * (a^-1 * b)^t: constant screw motion from a (t = 0) to b (t = 1), the shorter way round.
+    """Return a * (a^-1 * b)^t (8,): constant screw motion from a (t = 0) to b (t = 1), by the smaller rotation.
 
-    At a half turn both ways are equally long; the one with w >= 0 in a^-1 * b is taken.
+    At a rotation of pi both are equal; the one with w >= 0 in a^-1 * b is taken.
     """
     delta = multiply(inverse(a), b)
     if delta[0] < 0:

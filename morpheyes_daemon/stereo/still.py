@@ -1,6 +1,6 @@
-"""Depth of a single pair of pictures, taken by any camera: rectified ones with f and b, or raw ones with a rig.
+"""Depth of a single stereo pair of any camera: rectified images with f and b, or raw ones with a calibrated rig.
 
-The flying pipeline is `depth.DepthEstimator`, which this uses for raw pictures.
+The pipeline in flight is `depth.DepthEstimator`, which is used here for raw images.
 """
 
 from __future__ import annotations
@@ -9,43 +9,43 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from morpheyes_daemon.errors import CalibrationError, InputError
-from morpheyes_daemon.messages.core import BaselineEstimate, FloatMap, Image, StereoFrame
+from morpheyes_daemon.messages.core import BaselineEstimate, FloatMap, Image, Mask, StereoFrame
 from morpheyes_daemon.stereo.depth import DepthEstimator, depth_from_disparity, grey, near_limit_m
 from morpheyes_daemon.stereo.matching import MatchSettings, disparity_range, match
 from morpheyes_daemon.stereo.rig import RigModel
 
 SEARCHED_SHARE = 0.25
-"""Share of the image width that is searched when nobody says how near to look."""
+"""Share of the image width that is searched without `near_m`; chosen: more finds nearer objects and takes longer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StillDepth:
-    """depth_m (H, W) float32 metres of the (rectified) left picture, NaN unknown; masks as in `messages.DepthMap`."""
+    """depth_m (H, W) float32 metres of the (rectified) left picture, NaN unknown; `near` and
+    `half_occluded` (H, W) as in `messages.core.DepthMap`; `baseline_m` is the true one."""
 
     left: Image
     depth_m: FloatMap
-    near: NDArray[np.bool_]
-    half_occluded: NDArray[np.bool_]
+    near: Mask
+    half_occluded: Mask
     near_limit_m: float
     baseline_m: float
     f_px: float
 
     @property
     def valid_fraction(self) -> float:
-        """Share of the pixels that have a depth."""
+        """Fraction of the pixels with a depth."""
         return float(np.isfinite(self.depth_m).mean())
 
     @property
     def ceiling_fraction(self) -> float:
-        """Share of the pixels that are nearer than `near_limit_m`."""
+        """Fraction of the pixels that are nearer than `near_limit_m`."""
         return float(self.near.mean())
 
     @property
     def median_depth_m(self) -> float | None:
-        """Median of the known depths, None when none is."""
+        """Median of the known depths, metres; None when none is known."""
         known = self.depth_m[np.isfinite(self.depth_m)]
         return float(np.median(known)) if known.size else None
 
@@ -55,8 +55,8 @@ def rectified_depth(
 ) -> StillDepth:
     """Return the depth of an already rectified pair: Z = b f / (d + doffs).
 
-    `near_m` is the nearest depth to look for. Raises InputError when the sizes differ or `near_m` needs more
-    disparities than the pictures are wide.
+    `left`, `right` (H, W) or (H, W, 3) uint8; `near_m` is the nearest depth to search. Raises InputError
+    when the sizes differ or `near_m` needs more disparities than the images are wide.
     """
     require_same_size(left, right)
     width = left.shape[1]
@@ -69,8 +69,8 @@ def rectified_depth(
         if count <= largest:
             nearest = near_limit_m(baseline_m, f_px, low + count, doffs_px)
             raise InputError(
-                f"Pictures {width} px wide at this baseline show nothing nearer than {nearest:.2f} m; "
-                f"ask for no less with --near-m."
+                f"Images {width} px wide at this baseline have no depth nearer than {nearest:.2f} m; "
+                f"give at least that to --near-m."
             )
     found = match(grey(left), grey(right), count, MatchSettings(), min_disparity=low)
     depth_m = depth_from_disparity(found.disparity_px, baseline_m, f_px, doffs_px)
@@ -81,7 +81,7 @@ def rectified_depth(
 def raw_depth(
     left: Image, right: Image, rig: RigModel, baseline_m: float | None = None, near_m: float | None = None
 ) -> StillDepth:
-    """Return the depth of a raw pair of a calibrated rig, in its rectified left picture.
+    """Return the depth of a raw pair (H, W) or (H, W, 3) of a calibrated rig, in its rectified left image.
 
     `baseline_m` is the nominal one and may be left out for a fixed rig. Raises InputError when the sizes differ,
     CalibrationError when the rig does not fit the pictures or the baseline.
@@ -91,7 +91,7 @@ def raw_depth(
         low, high = rig.range_m
         if low != high:
             raise CalibrationError(
-                f"The calibration covers {low * 1e3:g} to {high * 1e3:g} mm; say which baseline with --baseline-m."
+                f"The calibration covers {low * 1e3:g} to {high * 1e3:g} mm; name the baseline with --baseline-m."
             )
         baseline_m = low
     height, width = left.shape[:2]
@@ -105,7 +105,7 @@ def raw_depth(
 
 
 def halves(picture: Image) -> tuple[Image, Image]:
-    """Return the left and right half of a side-by-side picture; raises InputError when its width is odd."""
+    """Return the left and right half of a side-by-side picture (H, 2 W[, 3]); raises InputError on an odd width."""
     width = picture.shape[1]
     if width % 2:
         raise InputError(f"A side-by-side picture has an even width, this one is {width} px wide; name two pictures.")
@@ -113,7 +113,7 @@ def halves(picture: Image) -> tuple[Image, Image]:
 
 
 def require_same_size(left: Image, right: Image) -> None:
-    """Raise InputError when two pictures are not of the same size."""
+    """Raise InputError when two images (H, W[, 3]) differ in size."""
     if left.shape[:2] != right.shape[:2]:
-        sizes = [f"{eye.shape[1]}x{eye.shape[0]}" for eye in (left, right)]
+        sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (left, right)]
         raise InputError(f"The left picture is {sizes[0]} px, the right one {sizes[1]} px; both must be the same size.")

@@ -1,11 +1,9 @@
-"""How far a pixel lands from its place when one calibrated number is wrong (paper, section II).
-
-These are the paper's figures 2 and 3 and its table I.
+"""Pixel error by an error of one calibrated parameter: figures 2 and 3 and table I of the paper (section II).
 
 Intrinsics go through the lens model of `stereo.intrinsics`, extrinsics through the rectifying homographies
-H_L = K R_rect K^-1 and H_R = K R_rect R^T K^-1. One number is wrong at a time, in an otherwise straight lens. Every
-error is read where it is largest in the image, at a corner: only so does table I come out (a mean would give k3 a
-ratio of 2.67).
+H_L = K R_rect K^-1 and H_R = K R_rect R^T K^-1. One parameter is wrong at a time, without further distortion. The
+statistic is the largest error over the image, at a corner: with it table I is reproduced (a mean gives a ratio of
+2.67 for k3).
 """
 
 from __future__ import annotations
@@ -29,26 +27,31 @@ FOCAL_LENGTHS_MM = (1.5, 2.0, 3.0, 4.0, 8.0, 16.0)
 
 INTRINSIC = ("f", "alpha", "k1", "k2", "k3", "k5")
 SWEPT = (*INTRINSIC, "k4")
-"""What figure 2 is drawn for: the table's columns, and k4, which the paper leaves out since it mirrors k3."""
+"""Parameters of figure 2: the columns of table I, and k4, which the paper omits since it mirrors k3."""
 EXTRINSIC = ("T", "phi", "theta", "psi")
-"""The columns of table I. T is T_x; phi, theta, psi turn about x, y, z of the right eye."""
+"""The columns of table I: T is T_x; phi, theta, psi are rotations about x, y, z of the right camera."""
 
 NOMINAL: Mapping[str, float] = {"alpha": 1e-3, "k1": -0.1, "k2": 0.02, "k3": 1e-3, "k4": 1e-3, "k5": 5e-3}
-"""What errors are percent of, since the paper does not say; table I does not depend on it."""
+"""Values that errors in percent refer to; chosen, since the paper does not state them; table I does not depend on
+them."""
 
 GRID_POINTS = 65
-"""Points per side at which errors are looked at."""
+"""Points per side of the grid of errors; chosen: the errors are smooth over 2 pixels."""
 
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5")
+"""Names of the distortion coefficients in the paper's order."""
 
 ERROR_PCT = 1.0
 ERROR_DEG = 0.1
-"""The errors at which table I is taken; errors this small act linearly."""
+"""Errors (percent, degrees) at which table I is computed; chosen: small enough to act linearly."""
 
 
 @dataclass(frozen=True, eq=False)
-class EyePair:
-    """Two eyes to be analysed: lenses and the pose R, T of the paper (right eye from left: R_cam1_cam0, t in m)."""
+class CameraPair:
+    """Two cameras to be analysed: lenses and relative pose.
+
+    R_cam1_cam0 (3, 3) is the paper's R, right camera from left; t_cam0_cam1_m (3,) its T in metres.
+    """
 
     cam0: CameraIntrinsics
     cam1: CameraIntrinsics
@@ -71,22 +74,22 @@ def paper_lens(focal_mm: float) -> CameraIntrinsics:
     return CameraIntrinsics(WIDTH_PX, WIDTH_PX, f_px, f_px, middle, middle)
 
 
-def paper_pair(focal_mm: float) -> EyePair:
+def paper_pair(focal_mm: float) -> CameraPair:
     """Return the paper's rig for extrinsic errors: R = I, T = (200, 2, 2) mm (paper-notes 3), no distortion."""
     lens = paper_lens(focal_mm)
-    return EyePair(lens, lens, np.eye(3), np.array([0.200, 0.002, 0.002]))
+    return CameraPair(lens, lens, np.eye(3), np.array([0.200, 0.002, 0.002]))
 
 
-def rig_pair(rig: RigModel, baseline_m: float) -> EyePair:
-    """Return a calibrated rig at a nominal baseline."""
+def rig_pair(rig: RigModel, baseline_m: float) -> CameraPair:
+    """Return a calibrated rig at a nominal baseline; raises CalibrationError outside its range."""
     T_cam0_cam1 = rig.T_cam0_cam1(baseline_m)
-    return EyePair(rig.cam0, rig.cam1, T_cam0_cam1[:3, :3].T, T_cam0_cam1[:3, 3])
+    return CameraPair(rig.cam0, rig.cam1, T_cam0_cam1[:3, :3].T, T_cam0_cam1[:3, 3])
 
 
 def intrinsic_error(lens: CameraIntrinsics, name: str, error_pct: float) -> PixelError:
-    """Return where pixels land with `name` wrong by a share, against where they should.
+    """Return the largest pixel error when the parameter `name` is wrong by `error_pct` percent.
 
-    The share is of the lens's own value, or of `NOMINAL` where that is zero.
+    Percent of the lens's own value, or of `NOMINAL` where that is zero (paper, figure 2).
     """
     xy = _ideal_grid(lens)
     right = _alone(lens, name, 1.0)
@@ -94,8 +97,8 @@ def intrinsic_error(lens: CameraIntrinsics, name: str, error_pct: float) -> Pixe
     return _largest(wrong.pixels_from_normalised(xy) - right.pixels_from_normalised(xy))
 
 
-def extrinsic_error(pair: EyePair, name: str, error: float) -> tuple[PixelError, PixelError]:
-    """Return the errors in the left and the right rectified image.
+def extrinsic_error(pair: CameraPair, name: str, error: float) -> tuple[PixelError, PixelError]:
+    """Return the largest pixel errors in the left and the right rectified image (paper, figure 3).
 
     `error` is percent for T (that is T_x; T_y and T_z act alike), degrees for phi, theta, psi (R wrong by R_e).
     """
@@ -110,8 +113,8 @@ def extrinsic_error(pair: EyePair, name: str, error: float) -> tuple[PixelError,
     return _largest(wrong[0] - true[0]), _largest(wrong[1] - true[1])
 
 
-def table_1(lens: CameraIntrinsics, pair: EyePair) -> dict[str, object]:
-    """Return table I: e_y / e_x per intrinsic number, left / right error per extrinsic one, in x and in y."""
+def table_1(lens: CameraIntrinsics, pair: CameraPair) -> dict[str, object]:
+    """Return table I: e_y / e_x per intrinsic parameter, left / right error per extrinsic one, in x and in y."""
     intrinsic = {}
     for name in INTRINSIC:
         error = intrinsic_error(lens, name, ERROR_PCT)
@@ -133,7 +136,7 @@ def nominal(lens: CameraIntrinsics, name: str) -> float:
 
 
 def _alone(lens: CameraIntrinsics, name: str, factor: float) -> CameraIntrinsics:
-    """Return the lens with `name` times `factor` and nothing else that bends."""
+    """Return the lens with the parameter `name` times `factor` and no other distortion."""
     straight = replace(lens, alpha=0.0, k=(0.0, 0.0, 0.0, 0.0, 0.0))
     if name == "f":
         return replace(straight, fx=lens.fx * factor, fy=lens.fy * factor)
@@ -145,17 +148,14 @@ def _alone(lens: CameraIntrinsics, name: str, factor: float) -> CameraIntrinsics
 
 
 def _ideal_grid(lens: CameraIntrinsics) -> Array:
-    """Return where pixels (h, w, 2) would look through the same lens without distortion: the paper's x.
-
-    They lie on a grid over the whole image with its edges, dense enough for errors as smooth as these.
-    """
+    """Return normalised coordinates (h, w, 2) of a grid over the whole image without distortion: the paper's x."""
     u = np.linspace(0, lens.width - 1, min(lens.width, GRID_POINTS))
     v = np.linspace(0, lens.height - 1, min(lens.height, GRID_POINTS))
     return np.stack(np.meshgrid((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy), axis=-1)
 
 
-def _rectified(pair: EyePair, R_cam1_cam0: Array, t_cam0_cam1: Array) -> tuple[Array, Array]:
-    """Return the rectified pixels of every pixel of the left and the right image."""
+def _rectified(pair: CameraPair, R_cam1_cam0: Array, t_cam0_cam1: Array) -> tuple[Array, Array]:
+    """Return the rectified pixels (h, w, 2) of the grid in the left and the right image."""
     R_rect = rectifying_rotation(t_cam0_cam1)
     left = _turned(pair.cam0, R_rect)
     return left, _turned(pair.cam1, R_rect @ R_cam1_cam0.T)

@@ -11,9 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from morpheyes_daemon.messages.core import SECTORS
 from morpheyes_daemon.wire.mavlink import Message, dialect
 
-SECTORS = 72
 MIN_CM = 5
 UNKNOWN = 65535
 _UNKNOWN_SENSOR = 4

@@ -1,7 +1,7 @@
-"""The pictures of a calibration report; each draws on a figure it is given what the calibration file holds.
+"""Figures of a calibration report, drawn from the content of the calibration file.
 
-Every function takes the rig and returns a matplotlib figure, or None where the file has nothing to show for it (an
-exact file, one baseline only). The page around them is `report`.
+Every function takes the rig and returns a matplotlib figure, or None where the file lacks the data (an exact file,
+a single baseline). The page around them is `html`.
 """
 
 from __future__ import annotations
@@ -15,44 +15,46 @@ from matplotlib.figure import Figure
 
 from morpheyes_daemon.calibration.report.depth_error_budget import DISTANCES_M, Conditions, depth_errors
 from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
-from morpheyes_daemon.transforms import rpy_from_R
+from morpheyes_daemon.transforms import R_FRD_CAM, rpy_from_R
 
 INK, MUTED, GRID = "#1c2430", "#66707f", "#e3e7ec"
 BLUE, ORANGE, GREEN, RED, PURPLE = "#2f6fde", "#e8833a", "#2a9d6f", "#d1453b", "#8a63d2"
 CAUSES = (("matcher", BLUE), ("yaw", ORANGE), ("baseline length", GREEN), ("time offset", PURPLE))
 _WIDE, _HALF = (9.6, 3.1), (4.7, 3.1)
+"""Sizes of figures, inches; chosen: the width of the page at 100 dpi."""
 _GOOD_ROW_PX = 0.2
-"""The map's colours reach at least this far, so that a good rig does not look alarming."""
+"""Least upper end of the colour scale of row errors, pixels; chosen: a good rig appears pale."""
 _FEWEST_BARS = 5
+"""Bars that a plot has room for at least; chosen: a single bar would fill it."""
 
 
 def calibrated(rig: RigModel) -> list[CalibratedBaseline]:
-    """Return the baselines that pictures were taken at; those between them are the rail's."""
+    """Return the baselines at which pictures were taken, without those interpolated by the rail model."""
     return [baseline for baseline in rig.baselines if baseline.rms_px is not None] or list(rig.baselines)
 
 
 def coverage_map(rig: RigModel) -> Figure | None:
-    """Where in each eye's image corners were seen."""
+    """Return the map of corners per cell in the image of each camera."""
     seen = rig.details.get("coverage")
     if not seen:
         return None
     figure = Figure(figsize=_WIDE, layout="constrained")
     axes = figure.subplots(1, 2)
     most = max(np.max(seen["left"]), np.max(seen["right"]), 1)
-    for ax, eye in zip(axes, ("left", "right"), strict=True):
-        counts = np.array(seen[eye])
+    for ax, side in zip(axes, ("left", "right"), strict=True):
+        counts = np.array(seen[side])
         shown = np.where(counts > 0, counts, np.nan)
-        image = _cells(ax, shown, rig, "YlGnBu", 0, float(most))
+        image = _cells(ax, shown, rig, "YlGnBu", (0, float(most)))
         for row, column in np.argwhere(counts == 0):
             at = _cell_centre(rig, counts.shape, row, column)
             ax.text(*at, "none", ha="center", va="center", color=RED, size=8)
-        ax.set_title(f"{eye} eye: {np.mean(counts > 0):.0%} of the image", loc="left")
-    _bar_of_colours(figure, image, axes, "corners seen")
+        ax.set_title(f"{side} camera: {np.mean(counts > 0):.0%} of the image", loc="left")
+    _colour_bar(figure, image, axes, "corners seen")
     return figure
 
 
 def rms_bars(rig: RigModel) -> Figure | None:
-    """How well the corners fit at each baseline, and held-out rows beside it."""
+    """Return the rms of the corners at each baseline, beside the row errors of held-out boards."""
     chosen = [baseline for baseline in rig.baselines if baseline.rms_px is not None]
     if not chosen:
         return None
@@ -67,7 +69,7 @@ def rms_bars(rig: RigModel) -> Figure | None:
     if len(views) == len(chosen):
         labels = [f"{label}\n{count} views" for label, count in zip(labels, views, strict=True)]
     ax.set_xticks(x, labels)
-    _room_for_bars(ax, len(chosen))
+    _limit_bar_width(ax, len(chosen))
     ax.set_xlabel("nominal baseline, mm")
     ax.set_ylabel("px")
     ax.legend(loc="upper left", bbox_to_anchor=(0, 1.18), ncols=2)
@@ -75,24 +77,24 @@ def rms_bars(rig: RigModel) -> Figure | None:
 
 
 def held_out_map(rig: RigModel) -> Figure | None:
-    """Row error on boards the solve had not seen, by region of the left image."""
+    """Return the map of the row error on held-out boards over the left image."""
     cells = rig.details.get("held_out", {}).get("median_by_cell_px")
     if not cells:
         return None
     values = np.array([[np.nan if value is None else value for value in row] for row in cells], dtype=float)
     figure, ax = _plot(_HALF)
     top = max(_GOOD_ROW_PX, float(np.nanpercentile(values, 95)) * 1.15)
-    image = _cells(ax, values, rig, "YlOrRd", 0.0, top)
+    image = _cells(ax, values, rig, "YlOrRd", (0.0, top))
     for (row, column), value in np.ndenumerate(values):
         text, color = ("–", MUTED) if np.isnan(value) else (f"{value:.2f}", "white" if value > 0.65 * top else INK)
         ax.text(*_cell_centre(rig, values.shape, row, column), text, ha="center", va="center", color=color, size=7)
     ax.set_title("left image, median of |row difference|", loc="left")
-    _bar_of_colours(figure, image, ax, "px")
+    _colour_bar(figure, image, ax, "px")
     return figure
 
 
 def leave_one_out_curve(rig: RigModel) -> Figure | None:
-    """Each inner baseline predicted by the others."""
+    """Return the errors of each inner baseline predicted by the others."""
     rows: Sequence[Mapping[str, float]] = rig.details.get("leave_one_out") or []
     if not rows:
         return None
@@ -114,7 +116,7 @@ def leave_one_out_curve(rig: RigModel) -> Figure | None:
 
 
 def rail_curves(rig: RigModel) -> Figure | None:
-    """What the eyes do besides moving apart: angles and offsets along the rail."""
+    """Return the angles and offsets of the right camera along the rail."""
     if len(rig.baselines) < 2:
         return None
     figure = Figure(figsize=_WIDE, layout="constrained")
@@ -137,15 +139,15 @@ def rail_curves(rig: RigModel) -> Figure | None:
             ax.plot(b[known] * 1e3, values[known, column], "o", color=colour, ms=4)
         ax.set_xlabel("nominal baseline, mm")
     axes[0].set_title("true length minus nominal, mm", loc="left")
-    axes[1].set_title("right eye against left, degrees", loc="left")
-    axes[2].set_title("right eye's offset, mm", loc="left")
+    axes[1].set_title("right camera relative to left, degrees", loc="left")
+    axes[2].set_title("right camera's offset, mm", loc="left")
     for ax in axes[1:]:
         ax.legend()
     return figure
 
 
 def depth_error_bars(rig: RigModel, conditions: Conditions) -> Figure:
-    """Depth error to expect at 1, 2, 5 and 10 m, split by cause; the parts of a bar are shares of the variance."""
+    """Return the depth error to expect at `DISTANCES_M` by cause; the parts of a bar are shares of the variance."""
     figure = Figure(figsize=(9.6, 5.6), layout="constrained")
     axes = figure.subplots(2, 2).ravel()
     chosen = {baseline.nominal_m for baseline in calibrated(rig)}
@@ -165,7 +167,7 @@ def depth_error_bars(rig: RigModel, conditions: Conditions) -> Figure:
         ax.set_xticks(x, [f"{error.nominal_m * 1e3:g}" for error in at], size=8)
         ax.set_title(f"at {distance:g} m: one sigma, cm", loc="left")
         ax.margins(y=0.15)
-        _room_for_bars(ax, len(at))
+        _limit_bar_width(ax, len(at))
     axes[0].legend(ncols=2, fontsize=8)
     figure.supxlabel("nominal baseline, mm", size=9, color=MUTED)
     return figure
@@ -192,25 +194,25 @@ def _style(ax: Axes) -> None:
     ax.title.set_color(INK)
 
 
-def _room_for_bars(ax: Axes, count: int) -> None:
-    """Keep a lone bar from filling the whole plot."""
+def _limit_bar_width(ax: Axes, count: int) -> None:
+    """Limit the width of few bars."""
     half = max(count, _FEWEST_BARS) / 2
     ax.set_xlim((count - 1) / 2 - half, (count - 1) / 2 + half)
 
 
-def _bar_of_colours(figure: Figure, image: Any, ax: Any, label: str) -> None:
+def _colour_bar(figure: Figure, image: Any, ax: Any, label: str) -> None:
     bar = figure.colorbar(image, ax=ax, shrink=0.9)
     bar.set_label(label, size=9, color=MUTED)
     bar.ax.tick_params(labelsize=8, colors=MUTED, length=0)
     bar.outline.set_visible(False)
 
 
-def _cells(ax: Axes, values: Any, rig: RigModel, colours: str, low: float, high: float) -> Any:
+def _cells(ax: Axes, values: Any, rig: RigModel, colours: str, limits: tuple[float, float]) -> Any:
     _style(ax)
     ax.grid(False)
     width, height = rig.size
     ax.set_facecolor("#f3f5f7")
-    image = ax.imshow(values, cmap=colours, vmin=low, vmax=high, extent=(0, width, height, 0), aspect="equal")
+    image = ax.imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1], extent=(0, width, height, 0), aspect="equal")
     ax.set_xticks([0, width])
     ax.set_yticks([0, height])
     return image
@@ -222,7 +224,6 @@ def _cell_centre(rig: RigModel, shape: tuple[int, ...], row: int, column: int) -
 
 
 def _angles(R_cam0_cam1: Any) -> tuple[float, float, float]:
-    """Return pitch (about x), yaw (about y, to the right) and roll (about z) of the right eye in the left, rad."""
-    axes = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    roll, pitch, yaw = rpy_from_R(axes @ R_cam0_cam1 @ axes.T)
+    """Return pitch (about x), yaw (about y, to the right) and roll (about z) of the right camera in the left, rad."""
+    roll, pitch, yaw = rpy_from_R(R_FRD_CAM @ R_cam0_cam1 @ R_FRD_CAM.T)
     return pitch, yaw, roll

@@ -1,7 +1,7 @@
-"""The page that shows a calibration to a person: verdict first, then what it rests on, then what to do better.
+"""Report of a calibration: acceptance, figures of its quality, and pictures to take again.
 
-One HTML file with its pictures inside, or a PNG of the pictures alone; nothing is fetched from anywhere. All of it
-comes from the calibration file, so a report can be made years later.
+One self-contained HTML file, or a PNG of the figures alone; nothing is loaded from the network. All content comes from
+the calibration file, so a report can be made at any time.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ footer { color: var(--muted); font-size: 12.5px; overflow-wrap: anywhere; }
 
 
 def write_report(rig: RigModel, out: Path, conditions: Conditions | None = None) -> None:
-    """Write the report of `rig` as HTML or PNG, as the suffix of `out` says; raises CalibrationError otherwise."""
+    """Write the report of `rig` as HTML or PNG by the suffix of `out`; raises CalibrationError for any other suffix,
+    and when the file cannot be written."""
     expected = conditions or Conditions()
     if out.suffix.lower() not in (".html", ".htm", ".png"):
         raise CalibrationError(f"{out}: a report is written as .html or .png; name it so.")
@@ -69,13 +70,13 @@ def write_report(rig: RigModel, out: Path, conditions: Conditions | None = None)
 
 
 def report_html(rig: RigModel, conditions: Conditions) -> str:
-    """Return the whole page."""
+    """Return the report as one HTML page."""
     title = f"Calibration of {rig.details.get('rig', 'a stereo rig')}"
     sections = [
         _section("Depth error to expect", _depth_text(conditions), figures.depth_error_bars(rig, conditions)),
         _section("Fit at each baseline", _FIT, figures.rms_bars(rig)),
         _beside(
-            _block("Rows on boards the solve had not seen", _HELD_OUT, figures.held_out_map(rig)),
+            _block("Rows on held-out boards", _HELD_OUT, figures.held_out_map(rig)),
             _block("Scale check", "", None, _scale(rig)),
         ),
         _section("Leaving one baseline out", _LEFT_OUT, figures.leave_one_out_curve(rig)),
@@ -83,19 +84,19 @@ def report_html(rig: RigModel, conditions: Conditions) -> str:
         _section("Where boards were seen", _COVERAGE, figures.coverage_map(rig)),
         _section("Baselines", "", None, _baseline_table(rig)),
         _section("Cameras", "", None, _camera_table(rig)),
-        _section("Pictures set aside", "", None, _aside(rig)),
+        _section("Pictures set aside", "", None, _set_aside(rig)),
     ]
     return (
         f"<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
         f"<title>{html.escape(title)}</title><style>{_STYLE}</style><main>"
         f"<header><h1>{html.escape(title)}</h1><p>{html.escape(_subtitle(rig))}</p></header>"
-        f"{_verdict(rig)}{_cards(rig)}{''.join(sections)}"
+        f"{_acceptance(rig)}{_cards(rig)}{''.join(sections)}"
         f"<footer>sha256 {calibration_hash(rig)}</footer></main></html>"
     )
 
 
 def report_png(rig: RigModel, conditions: Conditions) -> bytes:
-    """Return the pictures one under the other as a PNG."""
+    """Return the figures, stacked, as the content of a PNG file."""
     import cv2
 
     drawn = [
@@ -117,17 +118,17 @@ def report_png(rig: RigModel, conditions: Conditions) -> bytes:
     return bytes(encoded)
 
 
-_FIT = "Distance between corners seen and those the solved rig predicts, and how far rows differ on held-out boards."
-_HELD_OUT = "After rectification a corner should lie on the same row in both eyes. Boards were left out in turn."
-_LEFT_OUT = "Each inner baseline is left out and predicted by the others: what the rig is worth in between."
-_RAIL = "How the right eye stands to the left one. Dots were calibrated; lines are what the daemon uses in between."
-_COVERAGE = "Corners counted over the image. A lens is only known where boards were seen."
+_FIT = "Distance between detected and predicted corners, and row offsets on held-out boards."
+_HELD_OUT = "After rectification a corner should lie on the same row in both images. Boards were left out in turn."
+_LEFT_OUT = "Each inner baseline is left out and predicted by the others: the accuracy between calibrated baselines."
+_RAIL = "Pose of the right camera relative to the left one. Dots were calibrated; lines are interpolated as in flight."
+_COVERAGE = "Corners per cell of the image. The lens model is only determined where boards were seen."
 
 
 def _depth_text(conditions: Conditions) -> str:
     return (
-        f"One sigma, for a matcher that is good to {conditions.sigma_disparity_px:g} px, a servo that repeats to "
-        f"{conditions.sigma_servo_m * 1e3:g} mm, eyes {conditions.sync_s * 1e3:g} ms apart and "
+        f"One sigma, for a matcher noise of {conditions.sigma_disparity_px:g} px, a servo repeatability of "
+        f"{conditions.sigma_servo_m * 1e3:g} mm, a time offset of {conditions.sync_s * 1e3:g} ms and "
         f"{conditions.sideways_m_s:g} m/s sideways. Colours are shares of the variance; percent of the distance."
     )
 
@@ -151,8 +152,8 @@ def _colour(rig: RigModel) -> str:
     return _GREEN if text.startswith("fit") else _RED if text.startswith("do not") else _AMBER
 
 
-def _verdict(rig: RigModel) -> str:
-    text = str(rig.details.get("verdict", "no verdict: this file holds no figures of a solve"))
+def _acceptance(rig: RigModel) -> str:
+    text = str(rig.details.get("verdict", "not judged: this file has no figures of a solve"))
     head, _, reason = text.partition(": ")
     advice = [item for item in rig.details.get("retake", []) if item != reason]
     items = "".join(f"<li>{html.escape(item)}</li>" for item in ([reason] if reason else []) + advice)
@@ -186,14 +187,14 @@ def _scale(rig: RigModel) -> str:
         return ""
     board = rig.details["board"]["square_mm"]
     rows = [
-        ("squares as told", f"{board:.3f} mm"),
-        ("squares triangulated from both eyes", f"{scale['square_mm']:.3f} ± {scale['square_scatter_mm']:.3f} mm"),
+        ("squares as given", f"{board:.3f} mm"),
+        ("squares triangulated from both cameras", f"{scale['square_mm']:.3f} ± {scale['square_scatter_mm']:.3f} mm"),
     ]
     if scale.get("length_ratio") is not None:
         rows.append(("solved lengths against the folders' names", f"× {scale['length_ratio']:.4f}"))
     note = (
-        "No picture can tell the size of a square: if it was told wrong, all depths are wrong by the same factor. "
-        "Hold a tape to something in view and compare."
+        "No picture shows the size of a square: if it was given wrongly, all depths are wrong by the same factor. "
+        "Measure a distance in view with a tape and compare."
     )
     return _table((), rows) + f"<p style='color:var(--muted)'>{note}</p>"
 
@@ -228,13 +229,13 @@ def _camera_table(rig: RigModel) -> str:
 
 def _with_sigma(name: str, values: list[float], sigma: Any) -> tuple[str, str, str, str]:
     shown = []
-    for value, eye in zip(values, ("cam0", "cam1"), strict=True):
-        known = sigma.get(eye, {}).get(name)
+    for value, side in zip(values, ("cam0", "cam1"), strict=True):
+        known = sigma.get(side, {}).get(name)
         shown += [f"{value:.5g}" if abs(value) < 10 else f"{value:.3f}", "" if known is None else f"± {known:.2g}"]
     return shown[0], shown[1], shown[2], shown[3]
 
 
-def _aside(rig: RigModel) -> str:
+def _set_aside(rig: RigModel) -> str:
     outliers = rig.details.get("outliers", [])
     problems = rig.details.get("problems", [])
     rows = [(str(outlier["file"]), f"does not fit: {outlier['rms_px']:.2f} px") for outlier in outliers]

@@ -1,4 +1,4 @@
-"""Fit to fly, or what to retake: the figures of a calibration turned into words a person can act on."""
+"""Acceptance of a calibration: fit to fly, fly with care or do not fly, and the pictures to take again."""
 
 from __future__ import annotations
 
@@ -14,44 +14,55 @@ from morpheyes_daemon.calibration.solver.uncertainty import BaselineUncertainty
 from morpheyes_daemon.calibration.targets.coverage import coverage, empty_corners
 
 HELD_OUT_GOOD_PX, HELD_OUT_LIMIT_PX = 0.5, 1.0
-"""Held-out row error, 95th percentile: factory rigs stay under the first; matching suffers from the second on."""
+"""Limits of the 95th percentile of held-out row errors, pixels; chosen: a matcher searches along one row, so errors of
+a pixel lose matches; lower limits refuse usable rigs."""
 _RMS_LIMIT_PX = 0.6
+"""Largest rms of the corners at a baseline, pixels; chosen: more is motion or a wrong board."""
 _YAW_GOOD_PX = 0.25
-"""Disparity bias at infinity, one sigma: as large as the matcher's own noise."""
+"""Largest sigma of the disparity at infinity, pixels; chosen: the matcher's own noise."""
 _FEWEST_VIEWS = 8
+"""Stereo views per baseline below which more are asked for; chosen: two thirds of `BASELINE_VIEWS`."""
 _LEAST_COVERAGE = 0.8
+"""Fraction of the image that boards should cover; chosen: distortion is extrapolated elsewhere."""
 _OUTLIER_SHARE = 0.25
-_LEFT_OUT_RATIO = 1.3
-_LEFT_OUT_FLOOR_PX = 0.05
+"""Fraction of outlier pictures at a baseline from which it should be retaken; chosen: a few are normal."""
+_LEFT_OUT_RATIO, _LEFT_OUT_FLOOR_PX = 1.3, 0.05
+"""Row error of a left-out baseline over that of the full solve, plus a floor in pixels, from which the rail does not
+fit it; chosen: lower ones report noise."""
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """`text` begins with "fit to fly", "fly with care" or "do not fly"; `retake` says what would make it better."""
+class Acceptance:
+    """`text` begins with "fit to fly", "fly with care" or "do not fly"; `retake` are sentences on what to retake."""
 
     text: str
     retake: tuple[str, ...]
 
 
-def judge(
-    calibration: Calibration,
-    held_out: HeldOut,
-    left_out: list[LeftOutBaseline],
-    uncertainty: list[BaselineUncertainty],
-    scale: ScaleCheck,
-    lost: tuple[str, ...],
-) -> Verdict:
-    """Return the verdict on a calibration from its figures; `lost` says which baselines could not be used at all."""
-    fatal = _fatal(calibration, held_out, scale)
-    advice = [*_views(calibration), *_cells(calibration), *_yaw(calibration, uncertainty), *_rail(left_out)]
+@dataclass(frozen=True)
+class Quality:
+    """Figures of a calibration: errors on held-out boards and on left-out baselines, uncertainties, scale."""
+
+    held_out: HeldOut
+    left_out: list[LeftOutBaseline]
+    uncertainty: list[BaselineUncertainty]
+    scale: ScaleCheck
+
+
+def judge(calibration: Calibration, quality: Quality, lost: tuple[str, ...]) -> Acceptance:
+    """Return the acceptance of a calibration; `lost` are sentences on baselines that could not be used."""
+    held_out = quality.held_out
+    fatal = _fatal(calibration, held_out, quality.scale)
+    advice = [*_views(calibration), *_cells(calibration), *_yaw(calibration, quality.uncertainty)]
+    advice += _rail(quality.left_out)
     retake = tuple([*fatal, *lost, *advice])
     if fatal:
-        return Verdict(f"do not fly: {fatal[0]}", retake)
+        return Acceptance(f"do not fly: {fatal[0]}", retake)
     if held_out.p95_px > HELD_OUT_GOOD_PX:
-        return Verdict(f"fly with care: rows of held-out boards differ by {held_out.p95_px:.2f} px (95 %)", retake)
+        return Acceptance(f"fly with care: rows of held-out boards differ by {held_out.p95_px:.2f} px (95 %)", retake)
     if advice or lost:
-        return Verdict(f"fly with care: {retake[0]}", retake)
-    return Verdict(f"fit to fly: rows of held-out boards agree within {held_out.p95_px:.2f} px (95 %)", retake)
+        return Acceptance(f"fly with care: {retake[0]}", retake)
+    return Acceptance(f"fit to fly: rows of held-out boards agree within {held_out.p95_px:.2f} px (95 %)", retake)
 
 
 def _fatal(calibration: Calibration, held_out: HeldOut, scale: ScaleCheck) -> list[str]:
@@ -88,19 +99,19 @@ def _views(calibration: Calibration) -> list[str]:
 def _cells(calibration: Calibration) -> list[str]:
     seen = coverage(calibration.observations)
     advice = []
-    for eye, counts in (("left", seen.left), ("right", seen.right)):
+    for side, counts in (("left", seen.left), ("right", seen.right)):
         empty = empty_corners(counts)
         if empty or np.mean(counts > 0) < _LEAST_COVERAGE:
             where = " and ".join(empty) or "border"
             advice.append(
-                f"boards cover {np.mean(counts > 0):.0%} of the {eye} image: show one in the {where} of the picture"
+                f"boards cover {np.mean(counts > 0):.0%} of the {side} image: show one in the {where} of the picture"
             )
     return advice
 
 
 def _yaw(calibration: Calibration, uncertainty: list[BaselineUncertainty]) -> list[str]:
     return [
-        f"the yaw at {nominal * 1e3:g} mm is known to {sigma.disparity_px:.2f} px only: add far and near boards there"
+        f"the yaw at {nominal * 1e3:g} mm is only known to {sigma.disparity_px:.2f} px: add far and near boards there"
         for nominal, sigma in zip(calibration.nominal_m, uncertainty, strict=True)
         if sigma.disparity_px > _YAW_GOOD_PX
     ]
@@ -108,7 +119,7 @@ def _yaw(calibration: Calibration, uncertainty: list[BaselineUncertainty]) -> li
 
 def _rail(left_out: list[LeftOutBaseline]) -> list[str]:
     return [
-        f"{one.baseline_mm:g} mm is not what its neighbours predict: take it and baselines beside it again"
+        f"{one.baseline_mm:g} mm differs from what its neighbours predict: retake it and the baselines beside it"
         for one in left_out
         if one.epipolar_median_px > _LEFT_OUT_RATIO * one.full_epipolar_median_px + _LEFT_OUT_FLOOR_PX
     ]

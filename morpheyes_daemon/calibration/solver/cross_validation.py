@@ -1,9 +1,9 @@
-"""How good is it, asked of pictures that the solve did not see.
+"""Cross-validation of a calibration on pictures that the solve did not use.
 
-Held out: every view is left out once and its rows are compared after rectification with what the other views gave.
-Leave one baseline out: everything taken at an inner baseline is left out, its geometry interpolated from its
-neighbours as the daemon does it, and compared with the full solve on the same boards (held out, too). Both start
-from the full solution, so they cost little.
+Held-out boards: every view is left out once, and its rows are compared after rectification by the solve of the other
+views. Leave one baseline out: all views of an inner baseline are left out, its geometry is interpolated from its
+neighbours as in flight, and compared with the full solve on the same boards (held out as well). Both start from the
+full solution, so they converge in a few steps.
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 from morpheyes_daemon.calibration.solver.projection import camera_from_vector
 from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px, row_error_px
 from morpheyes_daemon.calibration.solver.solver import Calibration, resolve
-from morpheyes_daemon.calibration.targets.observations import Progress, silent
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.stereo.rig import RigModel
 from morpheyes_daemon.transforms import Array
 
 _FOLDS = 4
+"""Folds of the held-out boards; chosen: more folds leave more views to each solve and take longer."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Row errors of all held-out corners that both eyes saw.
+    """Row errors of all held-out corners that both cameras saw.
 
     `row_px` (n,), signed; `left_px` (n, 2) where in the left image; `baseline` (n,) which baseline; `median_px` and
     `p95_px` of the absolute row error.
@@ -48,9 +49,9 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class LeftOutBaseline:
-    """One inner baseline predicted by the others, judged on that baseline's boards, which neither has seen.
+    """Errors of one inner baseline predicted by the others, on that baseline's boards.
 
-    `full_epipolar_median_px` is the full solve there, with the boards held out in turn.
+    `full_epipolar_median_px` is the row error of the full solve there, on held-out boards.
     """
 
     baseline_mm: float
@@ -61,14 +62,14 @@ class LeftOutBaseline:
 
 
 def geometry_at(calibration: Calibration, index: int) -> StereoGeometry:
-    """Return the solved geometry at one of the calibrated baselines."""
-    eyes, size = calibration.solution.state.eyes, calibration.observations.size
-    cam0, cam1 = camera_from_vector(eyes[0], size), camera_from_vector(eyes[1], size)
+    """Return the solved geometry at the calibrated baseline of an index."""
+    cameras, size = calibration.solution.state.cameras, calibration.observations.size
+    cam0, cam1 = camera_from_vector(cameras[0], size), camera_from_vector(cameras[1], size)
     return StereoGeometry(cam0, cam1, calibration.poses[index])
 
 
 def held_out(calibration: Calibration, progress: Progress = silent) -> HeldOut:
-    """Return the row errors of every view under a solve that did not see it (four folds)."""
+    """Return the row errors of every view under a solve without it (four-fold cross-validation)."""
     observations = calibration.observations
     fold = _folds(observations.baseline, len(observations.nominal_m))
     rows, places, baselines = [], [], []
@@ -87,7 +88,10 @@ def held_out(calibration: Calibration, progress: Progress = silent) -> HeldOut:
 
 
 def leave_one_out(calibration: Calibration, unseen: HeldOut, progress: Progress = silent) -> list[LeftOutBaseline]:
-    """Return for each inner baseline how well the others predict it; empty for fewer than three baselines."""
+    """Return the errors of each inner baseline predicted by the others; empty for fewer than three baselines.
+
+    `unseen` are the held-out errors of the full solve.
+    """
     count = len(calibration.nominal_m)
     results = []
     for index in range(1, count - 1):
@@ -103,10 +107,10 @@ def _left_out(calibration: Calibration, index: int, full_median_px: float) -> Le
     views = calibration.observations.baseline == index
     rest = resolve(calibration, ~views)
     nominal_m = float(calibration.nominal_m[index])
-    eyes = [camera_from_vector(eye, rest.observations.size) for eye in rest.solution.state.eyes]
+    cameras = [camera_from_vector(vector, rest.observations.size) for vector in rest.solution.state.cameras]
     knots_m, poses = rest.knots()
-    T = RigModel.from_poses(eyes[0], eyes[1], knots_m.tolist(), list(poses)).T_cam0_cam1(nominal_m)
-    predicted, full = StereoGeometry(eyes[0], eyes[1], T), geometry_at(calibration, index)
+    T = RigModel.from_poses(cameras[0], cameras[1], knots_m.tolist(), list(poses)).T_cam0_cam1(nominal_m)
+    predicted, full = StereoGeometry(cameras[0], cameras[1], T), geometry_at(calibration, index)
     return LeftOutBaseline(
         baseline_mm=nominal_m * 1e3,
         epipolar_median_px=float(np.median(np.abs(_row_errors(calibration, views, predicted)[0]))),
@@ -117,7 +121,7 @@ def _left_out(calibration: Calibration, index: int, full_median_px: float) -> Le
 
 
 def _row_errors(calibration: Calibration, views: NDArray[np.bool_], geometry: StereoGeometry) -> tuple[Array, Array]:
-    """Return the row error (n,) and left pixel (n, 2) of all corners that both eyes saw in the chosen views."""
+    """Return the row error (n,) and left pixel (n, 2) of all corners that both cameras saw in the chosen views."""
     left = calibration.observations.left[views].reshape(-1, 2)
     right = calibration.observations.right[views].reshape(-1, 2)
     seen = np.isfinite(left[:, 0]) & np.isfinite(right[:, 0])
@@ -127,11 +131,11 @@ def _row_errors(calibration: Calibration, views: NDArray[np.bool_], geometry: St
 
 
 def _folds(baseline: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Deal the views of each baseline out to the folds in turn; the turn goes on from baseline to baseline."""
+    """Return the fold (V,) of each view: the views of each baseline in turn, continued from baseline to baseline."""
     fold = np.empty(len(baseline), dtype=np.intp)
-    dealt = 0
+    assigned = 0
     for number in range(count):
         views = np.flatnonzero(baseline == number)
-        fold[views] = (dealt + np.arange(len(views))) % _FOLDS
-        dealt += len(views)
+        fold[views] = (assigned + np.arange(len(views))) % _FOLDS
+        assigned += len(views)
     return fold

@@ -1,7 +1,7 @@
-"""`calibrate solve` as a function: a folder of board pictures in, a calibration file and its figures out.
+"""Pipeline of `calibrate solve`: from a folder of board pictures to a calibration file and its figures.
 
-What is wrong with the pictures is named, left out, and kept in the file; only what makes the result worthless
-raises. Corners found are remembered beside the result, so nothing is lost then.
+Unusable pictures are left out and named in the file; only what invalidates the result raises. Detected corners are
+cached beside the result, so they are kept then, too.
 """
 
 from __future__ import annotations
@@ -11,18 +11,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from morpheyes_daemon.calibration.solver.acceptance import judge
+from morpheyes_daemon.calibration.solver.acceptance import Quality, judge
 from morpheyes_daemon.calibration.solver.cross_validation import held_out, leave_one_out
 from morpheyes_daemon.calibration.solver.plausibility import ScaleCheck, misnamed, scale_check
-from morpheyes_daemon.calibration.solver.result import Solved, details, rig_model
+from morpheyes_daemon.calibration.solver.result import CalibrationResult, details, rig_model
 from morpheyes_daemon.calibration.solver.solver import Calibration, calibrate
 from morpheyes_daemon.calibration.solver.uncertainty import baseline_uncertainty
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.calibration.targets.detection import CornerCache, observe
 from morpheyes_daemon.calibration.targets.image_pairs import read_folder
-from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.config.yaml_reader import parse_yaml, read_text
 from morpheyes_daemon.errors import CalibrationError, ConfigError
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.stereo.calibration_file import write_calibration
 
 CORNERS_SUFFIX = ".corners.npz"
@@ -30,10 +31,11 @@ CORNERS_SUFFIX = ".corners.npz"
 
 def solve_folder(
     root: Path, board: Board, out: Path | None, progress: Progress = silent, header: Mapping[str, Any] | None = None
-) -> Solved:
-    """Solve the pictures under `root`; writes `out` when given. Raises InputError or CalibrationError.
+) -> CalibrationResult:
+    """Return the calibration from the pictures under `root`, and write it to `out` when given.
 
-    `header` (date, name of the rig) is put first in the file's details.
+    `header` (date, name of the rig) comes first in the file's details. Raises InputError on unusable pictures,
+    CalibrationError as `solve_observations` does and when `out` cannot be written.
     """
     folders, problems = read_folder(root)
     cache = CornerCache(None if out is None else out.with_suffix(CORNERS_SUFFIX))
@@ -46,8 +48,11 @@ def solve_folder(
 
 def solve_observations(
     observations: Observations, progress: Progress = silent, header: Mapping[str, Any] | None = None
-) -> Solved:
-    """Solve, check and judge; raises CalibrationError when the two sizes a person gave cannot both be right."""
+) -> CalibrationResult:
+    """Return the calibration of observations with its quality and acceptance.
+
+    Raises CalibrationError when square size and folder names contradict each other, InputError on too few views.
+    """
     calibration, named = _without_misnamed(calibrate(observations, progress), progress)
     lost = observations.lost + named
     scale = scale_check(calibration)
@@ -55,14 +60,19 @@ def solve_observations(
     unseen = held_out(calibration, progress)
     left_out = leave_one_out(calibration, unseen, progress)
     uncertainty = [baseline_uncertainty(calibration, index) for index in range(len(calibration.nominal_m))]
-    verdict = judge(calibration, unseen, left_out, uncertainty, scale, lost)
+    acceptance = judge(calibration, Quality(unseen, left_out, uncertainty, scale), lost)
     rig = rig_model(calibration)
-    solved = Solved(calibration, unseen, left_out, uncertainty, scale, verdict, observations.problems + lost, rig)
+    solved = CalibrationResult(
+        calibration, unseen, left_out, uncertainty, scale, acceptance, observations.problems + lost, rig
+    )
     return replace(solved, rig=replace(rig, details={**(header or {}), **details(solved)}))
 
 
 def read_board_file(root: Path) -> Mapping[str, Any]:
-    """Return what `board.yaml` in the folder says (board, square_mm, marker_mm, rig); empty without one."""
+    """Return the content of `board.yaml` in a folder (board, square_mm, marker_mm, rig), empty without one.
+
+    Raises CalibrationError when it cannot be read.
+    """
     path = root / "board.yaml"
     if not path.is_file():
         return {}
@@ -76,7 +86,7 @@ def read_board_file(root: Path) -> Mapping[str, Any]:
 
 
 def _without_misnamed(calibration: Calibration, progress: Progress) -> tuple[Calibration, tuple[str, ...]]:
-    """Solve again without baselines whose length contradicts the folder's name, naming them."""
+    """Return the calibration without baselines that contradict their folder's name, and sentences on these."""
     observations = calibration.observations
     wrong = misnamed(observations.nominal_m, calibration.lengths_m)
     if not wrong:

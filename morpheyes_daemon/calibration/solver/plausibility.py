@@ -1,7 +1,7 @@
-"""Do the solved lengths agree with what the person said, and the boards with their own squares?
+"""Plausibility of the solved scale: baselines against the folders' names, squares against their given size.
 
-No picture tells the size of a square, so a wrong one scales the whole rig without any residual. What can notice it
-is the second size a person has given: the folders' names. Swapped or misnamed folders show here too.
+No picture shows the size of a square, so a wrong one scales the whole rig without any residual. It is detected by the
+other length that is given: the folders' names. Exchanged or misnamed folders are detected as well.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from morpheyes_daemon.calibration.solver.solver import Calibration
 from morpheyes_daemon.transforms import Array
 
 SCALE_TOLERANCE = 0.03
-"""Linear servos with a 1 % stroke error and a ruler's reading stay well within this of the names."""
+"""Relative difference of solved and nominal changes of the baseline; chosen: three times a 1 % stroke error."""
 ONE_LENGTH_TOLERANCE = 0.10
-"""For a single baseline: what is written on a rig is the distance of its lenses' housings, give or take."""
+"""The same for a single baseline; chosen: a rig is labelled by the distance of its housings."""
 NAME_TOLERANCE_M = 8e-3
-"""How far one baseline may lie from where its name puts it among the others; the paper's rail is within 1.83 mm."""
+"""Largest deviation of one baseline from the line through the others, metres; chosen: four times the paper's 1.83 mm."""
 
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """The board's own squares, measured by triangulation, and the solved lengths against the nominal ones.
+    """Squares of the board as triangulated, and solved baselines against nominal ones.
 
     `length_ratio` is solved over nominal change of baseline (plain ratio for one baseline), None without names.
     `square_mm` is the mean measured square, `square_scatter_mm` one sigma over board rows.
@@ -38,20 +38,23 @@ class ScaleCheck:
 
     @property
     def disagrees(self) -> bool:
-        """The square size and the folders' names cannot both be right."""
+        """Whether square size and folder names contradict each other."""
         limit = SCALE_TOLERANCE if self.baselines > 1 else ONE_LENGTH_TOLERANCE
         return self.length_ratio is not None and abs(self.length_ratio - 1.0) > limit
 
 
 def scale_check(calibration: Calibration) -> ScaleCheck:
-    """Return both scale checks of a calibration."""
+    """Return the scale check of a calibration."""
     squares = np.concatenate([_squares_m(calibration, index) for index in range(len(calibration.nominal_m))])
     ratio = length_ratio(calibration.observations.nominal_m, calibration.lengths_m)
     return ScaleCheck(float(np.mean(squares) * 1e3), float(np.std(squares) * 1e3), ratio, len(calibration.nominal_m))
 
 
 def length_ratio(nominal_m: Array, lengths_m: Array) -> float | None:
-    """Return by what the lengths (M,) grow per nominal metre, unmoved by a few misnamed folders (Theil-Sen)."""
+    """Return the slope of the solved baselines (M,) over the nominal ones (M,), robust to misnamed folders (Theil-Sen).
+
+    The plain ratio for one baseline, None without names.
+    """
     if not np.all(np.isfinite(nominal_m)):
         return None
     if len(nominal_m) == 1:
@@ -61,7 +64,7 @@ def length_ratio(nominal_m: Array, lengths_m: Array) -> float | None:
 
 
 def misnamed(nominal_m: Array, lengths_m: Array) -> list[int]:
-    """Return which baselines lie far from where the others say their names belong."""
+    """Return the indices of baselines (M,) that deviate from the line through the others by NAME_TOLERANCE_M."""
     if len(nominal_m) < 4 or not np.all(np.isfinite(nominal_m)):
         return []
     slope = length_ratio(nominal_m, lengths_m)
@@ -70,7 +73,7 @@ def misnamed(nominal_m: Array, lengths_m: Array) -> list[int]:
 
 
 def triangulate(geometry: StereoGeometry, left: Array, right: Array) -> Array:
-    """Return the points (..., 3) in the rectified frame of raw pixels (..., 2) of both eyes."""
+    """Return the points (..., 3), metres in rect axes, of raw pixels (..., 2) in both images: Z = b f / d."""
     rect_left, rect_right = geometry.rectified(left, right)
     depth = geometry.length_m * geometry.f_px / (rect_left[..., 0] - rect_right[..., 0])
     rows = (rect_left[..., 1] + rect_right[..., 1]) / 2
@@ -78,7 +81,7 @@ def triangulate(geometry: StereoGeometry, left: Array, right: Array) -> Array:
 
 
 def _squares_m(calibration: Calibration, index: int) -> Array:
-    """Return the square size measured along every full row of the board at one baseline."""
+    """Return the square size (n,) in metres along every complete row of the board at one baseline."""
     observations, board = calibration.observations, calibration.observations.board
     views = observations.baseline == index
     points = triangulate(geometry_at(calibration, index), observations.left[views], observations.right[views])

@@ -1,4 +1,4 @@
-"""The camera model of stereo/intrinsics.py with its derivatives, over many points at once.
+"""The camera model of `stereo.intrinsics` with its derivatives, vectorized over points.
 
 A camera is the vector (fx, fy, cx, cy, alpha, k1, k2, k3, k4, k5), the paper's K and distortion (section II).
 """
@@ -11,6 +11,7 @@ from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.transforms import Array
 
 CAMERA_PARAMETERS = ("fx_px", "fy_px", "cx_px", "cy_px", "alpha", "k1", "k2", "k3", "k4", "k5")
+"""Names of the components of a camera vector (10,)."""
 
 
 def camera_vector(camera: CameraIntrinsics) -> Array:
@@ -25,7 +26,11 @@ def camera_from_vector(parameters: Array, size: tuple[int, int]) -> CameraIntrin
 
 
 def project(p_cam: Array, camera: Array) -> tuple[Array, Array, Array]:
-    """Return pixels (..., 2) of points (..., 3), their derivatives to camera (..., 2, 10) and point (..., 2, 3)."""
+    """Return the pixels (..., 2) of points (..., 3) in camera axes, and their derivatives by camera (..., 2, 10) and by
+    point (..., 2, 3).
+
+    `camera` (10,) as in `camera_vector` (paper, section II).
+    """
     fx, fy, cx, cy, alpha, k1, k2, k3, k4, k5 = camera
     inv_z = 1.0 / p_cam[..., 2]
     x, y = p_cam[..., 0] * inv_z, p_cam[..., 1] * inv_z

@@ -1,10 +1,10 @@
-"""What a linear actuator can do: its eyes move along a line, and whatever else they do changes smoothly.
+"""Motion model of the linear rail: the right camera moves along a line, and its other components change smoothly.
 
 Each of the six components of T_cam0_cam1 is a low-order polynomial of the nominal baseline plus a scatter of its own
-(play, the servo's repeatability). Order and scatter are chosen per component by how well the other baselines
+(play, repeatability of the servo). Order and scatter are chosen per component by how well the other baselines
 predict the one left out (leave-one-out predictive density of a Gaussian process with a flat prior on the
-polynomial; Rasmussen and Williams, 2006, sections 2.7 and 5.4.2), so a rail that wobbles is not straightened.
-What comes out is a quadratic on the unknowns of the joint solve; the pictures have the last word.
+polynomial; Rasmussen and Williams, 2006, sections 2.7 and 5.4.2), so a rail that is not straight is not
+smoothed. The result is a quadratic prior on the unknowns of the joint solve, weighed against the pictures.
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE, Prior
+from morpheyes_daemon.calibration.solver.bundle_adjustment import CAMERA_UNKNOWNS, POSE_UNKNOWNS, Prior
 from morpheyes_daemon.transforms import Array
 
 COMPONENTS = ("rotation_x", "rotation_y", "rotation_z", "x", "y", "z")
 FEWEST_BASELINES = 4
-"""Below this a line through the baselines could not be told from chance."""
+"""Fewest baselines for a rail model; chosen: with three a line leaves one degree of freedom."""
 _HIGHEST_ORDER = 4
-_SCATTER_RAD = np.geomspace(1e-6, 1e-2, 25)
-_SCATTER_M = np.geomspace(1e-6, 1e-2, 25)
+"""Highest polynomial order; chosen: higher ones oscillate between ten baselines."""
+_SCATTER_RAD = _SCATTER_M = np.geomspace(1e-6, 1e-2, 25)
+"""Candidates of the scatter, rad and metres; chosen: from far below to far above any servo, 1.5 times apart."""
 
 
 @dataclass(frozen=True)
 class RailComponent:
-    """How one component moves along the rail: polynomial order and scatter about it (rad or m, one sigma)."""
+    """Model of one pose component along the rail: polynomial order and scatter about it (rad or m, one sigma)."""
 
     name: str
     order: int
@@ -41,26 +42,25 @@ class Rail:
     components: tuple[RailComponent, ...]
 
     def information(self) -> Array:
-        """Return the quadratic (6 M, 6 M) on the stacked poses: deviation from the best polynomial over scatter."""
+        """Return the information (6 M, 6 M) on the stacked poses: deviation from the best polynomial over scatter."""
         count = len(self.nominal_m)
-        information = np.zeros((count, POSE, count, POSE))
+        information = np.zeros((count, POSE_UNKNOWNS, count, POSE_UNKNOWNS))
         for index, component in enumerate(self.components):
             basis = polynomial(self.nominal_m, self.nominal_m, component.order)
             orthonormal, _ = np.linalg.qr(basis)
             away = np.eye(count) - orthonormal @ orthonormal.T
             information[:, index, :, index] = away / component.scatter**2
-        return information.reshape(count * POSE, count * POSE)
+        return information.reshape(count * POSE_UNKNOWNS, count * POSE_UNKNOWNS)
 
     def at(self, poses: Array, covariance: Array, nominal_m: Array) -> Array:
         """Return the pose vectors (K, 6) at other nominal baselines (K,) from solved poses (M, 6).
 
-        The polynomial bends between the baselines, what they scatter about it is interpolated linearly: with a
-        straight rail this is the line between neighbours, with a wavy one it follows the wave. `covariance`
-        (6 M, 6 M) is that of the poses.
+        The polynomial is evaluated there, and the deviations of the neighbours from it are interpolated linearly.
+        `covariance` (6 M, 6 M) is that of the poses.
         """
         count = len(self.nominal_m)
-        blocks = covariance.reshape(count, POSE, count, POSE)
-        predicted = np.empty((len(nominal_m), POSE))
+        blocks = covariance.reshape(count, POSE_UNKNOWNS, count, POSE_UNKNOWNS)
+        predicted = np.empty((len(nominal_m), POSE_UNKNOWNS))
         for index, component in enumerate(self.components):
             basis = polynomial(self.nominal_m, self.nominal_m, component.order)
             spread = blocks[:, index, :, index] + np.eye(count) * component.scatter**2
@@ -73,14 +73,15 @@ class Rail:
 
 
 def fit_rail(nominal_m: Array, poses: Array, covariance: Array) -> Rail | None:
-    """Return the rail that predicts left-out baselines best, None for fewer than four baselines.
+    """Return the rail model that predicts left-out baselines best, None for fewer than four baselines (M,).
 
-    `poses` (M, 6) are solved freely, `covariance` (6 M, 6 M) is theirs, shared errors included.
+    `poses` (M, 6) are solved without a rail model, `covariance` (6 M, 6 M) is theirs with common errors (Rasmussen and
+    Williams 2006, sections 2.7 and 5.4.2).
     """
     count = len(nominal_m)
     if count < FEWEST_BASELINES:
         return None
-    blocks = covariance.reshape(count, POSE, count, POSE)
+    blocks = covariance.reshape(count, POSE_UNKNOWNS, count, POSE_UNKNOWNS)
     components = tuple(
         _fit(name, nominal_m, poses[:, index], blocks[:, index, :, index], _SCATTER_RAD if index < 3 else _SCATTER_M)
         for index, name in enumerate(COMPONENTS)
@@ -89,14 +90,14 @@ def fit_rail(nominal_m: Array, poses: Array, covariance: Array) -> Rail | None:
 
 
 def with_rail(prior: Prior, rail: Rail) -> Prior:
-    """Return the prior of the cameras with the rail's quadratic on the poses added."""
+    """Return the prior of the cameras with the rail's information on the poses added."""
     information = prior.information.copy()
-    information[EYES:, EYES:] += rail.information()
+    information[CAMERA_UNKNOWNS:, CAMERA_UNKNOWNS:] += rail.information()
     return Prior(prior.mean, information)
 
 
 def polynomial(nominal_m: Array, fitted_m: Array, order: int) -> Array:
-    """Return Chebyshev polynomials 0..order (n, order + 1) of baselines scaled to the fitted range."""
+    """Return Chebyshev polynomials 0..order (n, order + 1) of baselines (n,) scaled to the range of `fitted_m` (M,)."""
     low, high = float(fitted_m.min()), float(fitted_m.max())
     scaled = (2.0 * nominal_m - low - high) / (high - low)
     return np.asarray(np.polynomial.chebyshev.chebvander(scaled, order))
@@ -111,7 +112,7 @@ def _fit(name: str, nominal_m: Array, values: Array, covariance: Array, scatters
 
 
 def _left_out_density(nominal_m: Array, values: Array, covariance: Array, order: int, scatter: float) -> float:
-    """Return the summed log density of each value given all the others, in closed form."""
+    """Return the summed log density of each value given all others, in closed form (Rasmussen and Williams, 5.4.2)."""
     basis = polynomial(nominal_m, nominal_m, order)
     inverse = np.linalg.inv(covariance + scatter**2 * np.eye(len(values)))
     weighted = inverse @ basis

@@ -1,7 +1,7 @@
-"""What is left after rectification: row error between the eyes, and the disparity that points at infinity show.
+"""Residuals after rectification: row error between the images, and disparity of points at infinity.
 
-The row (epipolar) error is what a matcher suffers; the disparity at infinity is the bias that a yaw error or a wrong
-principal point adds to every disparity, which no row error shows. Both are measured in rectified pixels.
+The row (epipolar) error impairs matching; the disparity at infinity is the bias that an error of the yaw or of a
+principal point adds to every disparity, without any row error. Both are in rectified pixels.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rectify import homogeneous, rectifying_rotation
 from morpheyes_daemon.transforms import Array
 
-_GRID = (9, 7)
-_GRID_INSET = 0.06
+_GRID, _GRID_INSET = (9, 7), 0.06
+"""Columns and rows of the grid of test points, and its distance from the border as a fraction of the image; chosen:
+the residuals are smooth over the cells."""
 
 
 @dataclass(frozen=True, eq=False)
 class StereoGeometry:
-    """Both cameras and the pose between them (4, 4) at one baseline, as a calibration believes them."""
+    """Calibrated cameras and the pose T_cam0_cam1 (4, 4) between them at one baseline."""
 
     cam0: CameraIntrinsics
     cam1: CameraIntrinsics
@@ -28,16 +29,16 @@ class StereoGeometry:
 
     @property
     def f_px(self) -> float:
-        """The common focal length of the rectified eyes, as stereo.rectify takes it."""
+        """Common focal length of the rectified images, pixels, as in `stereo.rectify`."""
         return (self.cam0.fx + self.cam0.fy + self.cam1.fx + self.cam1.fy) / 4
 
     @property
     def length_m(self) -> float:
-        """Distance between the eyes."""
+        """True baseline, metres."""
         return float(np.linalg.norm(self.T_cam0_cam1[:3, 3]))
 
     def rectified(self, left: Array, right: Array) -> tuple[Array, Array]:
-        """Return raw pixels (..., 2) of both eyes as rectified ones about the principal point; NaN stays NaN."""
+        """Return the rectified pixels (..., 2) of raw ones (..., 2), relative to the principal point; NaN stays NaN."""
         R_rect_cam0 = rectifying_rotation(self.T_cam0_cam1[:3, 3])
         R_rect_cam1 = R_rect_cam0 @ self.T_cam0_cam1[:3, :3]
         return self._turned(self.cam0, R_rect_cam0, left), self._turned(self.cam1, R_rect_cam1, right)
@@ -48,19 +49,19 @@ class StereoGeometry:
 
 
 def row_error_px(geometry: StereoGeometry, left: Array, right: Array) -> Array:
-    """Return how far (...,) the rows of the same points differ after rectification."""
+    """Return the row error (...,), left minus right, of raw pixels (..., 2) of the same points after rectification."""
     rect_left, rect_right = geometry.rectified(left, right)
     return np.asarray(rect_left[..., 1] - rect_right[..., 1])
 
 
 def disparity_px(geometry: StereoGeometry, left: Array, right: Array) -> Array:
-    """Return the disparity (...,) of the same points after rectification."""
+    """Return the disparity (...,) of raw pixels (..., 2) of the same points after rectification."""
     rect_left, rect_right = geometry.rectified(left, right)
     return np.asarray(rect_left[..., 0] - rect_right[..., 0])
 
 
 def infinity_px(believed: StereoGeometry, true: StereoGeometry) -> Array:
-    """Return the disparity (n,) that a rig believed to be `believed` shows for points at infinity seen by `true`.
+    """Return the disparity (n,) of points at infinity seen by the rig `true` and rectified by `believed`.
 
     The points cover the left image; those outside the right one are left out.
     """
@@ -73,7 +74,7 @@ def infinity_px(believed: StereoGeometry, true: StereoGeometry) -> Array:
 
 
 def image_grid(camera: CameraIntrinsics) -> Array:
-    """Return points (n, 2) spread over the image."""
+    """Return a grid of pixels (n, 2) over the image of a camera."""
     width, height = camera.width - 1, camera.height - 1
     u = np.linspace(_GRID_INSET, 1 - _GRID_INSET, _GRID[0]) * width
     v = np.linspace(_GRID_INSET, 1 - _GRID_INSET, _GRID[1]) * height

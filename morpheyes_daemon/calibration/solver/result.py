@@ -1,4 +1,4 @@
-"""A solved calibration with all its figures: what `--json` prints, and the rig model with details for the file."""
+"""Result of a calibration: output of `--json`, and the rig model with the details of the file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from morpheyes_daemon.calibration.solver.acceptance import Verdict
+from morpheyes_daemon.calibration.solver.acceptance import Acceptance
 from morpheyes_daemon.calibration.solver.cross_validation import HeldOut, LeftOutBaseline
 from morpheyes_daemon.calibration.solver.plausibility import ScaleCheck
 from morpheyes_daemon.calibration.solver.projection import camera_from_vector
@@ -20,20 +20,20 @@ from morpheyes_daemon.stereo.rig import CalibratedBaseline, RigModel
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """A calibration, how it did on boards it had not seen, what to think of it, and the rig model with all of it."""
+class CalibrationResult:
+    """A calibration with its errors on held-out data, uncertainty, scale check, acceptance, and rig model."""
 
     calibration: Calibration
     held_out: HeldOut
     left_out: list[LeftOutBaseline]
     uncertainty: list[BaselineUncertainty]
     scale: ScaleCheck
-    verdict: Verdict
+    acceptance: Acceptance
     problems: tuple[str, ...]
     rig: RigModel
 
     def figures(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
+        """Return the output of `calibrate solve --json`."""
         calibration = self.calibration
         return {
             "nominal_mm": _rounded(calibration.nominal_m * 1e3, 4),
@@ -44,8 +44,8 @@ class Solved:
             "leave_one_out": [_left_out_row(one) for one in self.left_out],
             "leave_one_out_ratio": left_out_ratio(self.left_out),
             "outliers": [outlier.name for outlier in calibration.outliers],
-            "verdict": self.verdict.text,
-            "retake": list(self.verdict.retake),
+            "verdict": self.acceptance.text,
+            "retake": list(self.acceptance.retake),
             "problems": list(self.problems),
             "sigma_length_mm": _rounded([u.length_m * 1e3 for u in self.uncertainty], 4),
             "sigma_disparity_px": _rounded([u.disparity_px for u in self.uncertainty], 4),
@@ -58,9 +58,9 @@ class Solved:
 
 
 def rig_model(calibration: Calibration, details: Mapping[str, Any] | None = None) -> RigModel:
-    """Return the rig model of a calibration; baselines without rms lie between calibrated ones, on the rail."""
+    """Return the rig model of a calibration; baselines without rms are interpolated by the rail model."""
     state, size = calibration.solution.state, calibration.observations.size
-    cam0, cam1 = (camera_from_vector(eye, size) for eye in state.eyes)
+    cam0, cam1 = (camera_from_vector(vector, size) for vector in state.cameras)
     rms = calibration.rms_px
     sigma = [baseline_uncertainty(calibration, index) for index in range(len(calibration.nominal_m))]
     lengths, yaws = [one.length_m for one in sigma], [one.yaw_rad for one in sigma]
@@ -76,18 +76,18 @@ def rig_model(calibration: Calibration, details: Mapping[str, Any] | None = None
     return RigModel(cam0, cam1, tuple(baselines), "solved", details or {})
 
 
-def details(solved: Solved) -> dict[str, Any]:
-    """Return what the calibration file keeps for people and reports."""
+def details(solved: CalibrationResult) -> dict[str, Any]:
+    """Return the `details` of the calibration file, for people and reports."""
     calibration, board = solved.calibration, solved.calibration.observations.board
     seen = coverage(calibration.observations)
     left, right = camera_uncertainty(calibration)
     return {
         "board": {"board": board.label, "square_mm": board.square_m * 1e3},
-        "verdict": solved.verdict.text,
-        "retake": list(solved.verdict.retake),
+        "verdict": solved.acceptance.text,
+        "retake": list(solved.acceptance.retake),
         "views": np.bincount(calibration.observations.baseline, minlength=len(calibration.nominal_m)).tolist(),
         "corner_noise_px": calibration.solution.sigma_px,
-        "stray_corners": calibration.strays,
+        "stray_corners": calibration.stray_corners,
         "outliers": [{"file": o.name, "rms_px": round(o.rms_px, 3)} for o in calibration.outliers],
         "problems": list(solved.problems),
         "sigma": {
@@ -118,12 +118,12 @@ def _rail_rows(calibration: Calibration) -> list[dict[str, Any]]:
     return [{"component": c.name, "order": c.order, "scatter": c.scatter} for c in calibration.rail.components]
 
 
-def _by_baseline(solved: Solved) -> list[float | None]:
+def _by_baseline(solved: CalibrationResult) -> list[float | None]:
     rows, baseline = np.abs(solved.held_out.row_px), solved.held_out.baseline
     return [_median(rows[baseline == index]) for index in range(len(solved.calibration.nominal_m))]
 
 
-def _by_cell(solved: Solved) -> list[list[float | None]]:
+def _by_cell(solved: CalibrationResult) -> list[list[float | None]]:
     rows = np.abs(solved.held_out.row_px)
     column, row = cell_of(solved.held_out.left_px, solved.calibration.observations.size)
     cells = range(CELLS[1]), range(CELLS[0])
@@ -135,7 +135,7 @@ def _median(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
 
 
 def left_out_ratio(left_out: list[LeftOutBaseline]) -> float | None:
-    """Return the row error of the left-out baselines over that of the full solve on the same boards, both averaged."""
+    """Return the mean row error of left-out baselines over that of the full solve there; None without any."""
     if not left_out:
         return None
     full = sum(one.full_epipolar_median_px for one in left_out)

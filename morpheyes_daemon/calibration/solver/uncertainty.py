@@ -1,8 +1,7 @@
-"""How well the solve knows what it found: the covariance of the unknowns carried to what a person asks about.
+"""Uncertainty of a solve: its covariance propagated to the baseline and to the disparity.
 
-Length of the baseline, and the disparity bias at infinity given as an equivalent yaw (yaw and principal points can
-hardly be told apart, but only their joint effect reaches the depth). What the covariance cannot know, such as a
-board that is not flat, is not in it.
+The disparity bias at infinity is also given as an equivalent yaw (yaw and principal points are hardly separable, but
+only their joint effect reaches the depth). Model errors, such as a board that is not flat, are not included.
 """
 
 from __future__ import annotations
@@ -12,19 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from morpheyes_daemon.calibration.solver.bundle_adjustment import EYES, POSE
+from morpheyes_daemon.calibration.solver.bundle_adjustment import CAMERA_UNKNOWNS, POSE_UNKNOWNS
 from morpheyes_daemon.calibration.solver.projection import CAMERA_PARAMETERS, camera_from_vector
 from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px
 from morpheyes_daemon.calibration.solver.solver import Calibration
 from morpheyes_daemon.transforms import Array, R_from_rotvec, pose
 
 _STEP = 1e-2
-"""Of a sigma: the numeric derivative's step; everything is linear over it."""
+"""Step of the numeric derivative, in sigmas; chosen: small enough to be linear, large against rounding."""
 
 
 @dataclass(frozen=True)
 class BaselineUncertainty:
-    """One standard deviation each of what one baseline's geometry is used for."""
+    """One sigma each at one baseline: true baseline, disparity at infinity, and that as a yaw."""
 
     length_m: float
     disparity_px: float
@@ -32,28 +31,33 @@ class BaselineUncertainty:
 
 
 def baseline_uncertainty(calibration: Calibration, index: int) -> BaselineUncertainty:
-    """Return the uncertainty of the baseline's length and of the disparity at infinity there."""
+    """Return the uncertainty of the true baseline and of the disparity at infinity at the baseline of an index.
+
+    First-order propagation of the covariance, J C J^T.
+    """
     solution = calibration.solution
-    columns = np.concatenate([np.arange(EYES), EYES + POSE * index + np.arange(POSE)])
+    columns = np.concatenate(
+        [np.arange(CAMERA_UNKNOWNS), CAMERA_UNKNOWNS + POSE_UNKNOWNS * index + np.arange(POSE_UNKNOWNS)]
+    )
     covariance = solution.covariance[np.ix_(columns, columns)]
     values = solution.state.shared[columns]
     true = _geometry(values, calibration.observations.size)
     bias = _derivative(values, covariance, lambda v: _bias_px(v, true, calibration.observations.size))
-    direction = values[EYES + 3 :] / np.linalg.norm(values[EYES + 3 :])
-    length = float(np.sqrt(direction @ covariance[EYES + 3 :, EYES + 3 :] @ direction))
+    direction = values[CAMERA_UNKNOWNS + 3 :] / np.linalg.norm(values[CAMERA_UNKNOWNS + 3 :])
+    length = float(np.sqrt(direction @ covariance[CAMERA_UNKNOWNS + 3 :, CAMERA_UNKNOWNS + 3 :] @ direction))
     sigma_px = float(np.sqrt(bias @ covariance @ bias))
     return BaselineUncertainty(length, sigma_px, sigma_px / true.f_px)
 
 
 def camera_uncertainty(calibration: Calibration) -> tuple[dict[str, float], dict[str, float]]:
-    """Return one standard deviation per camera parameter, left and right eye."""
-    sigma = np.sqrt(np.diag(calibration.solution.covariance)[:EYES]).reshape(2, -1)
-    left, right = (dict(zip(CAMERA_PARAMETERS, map(float, eye), strict=True)) for eye in sigma)
+    """Return one sigma per parameter of the left and of the right camera."""
+    sigma = np.sqrt(np.diag(calibration.solution.covariance)[:CAMERA_UNKNOWNS]).reshape(2, -1)
+    left, right = (dict(zip(CAMERA_PARAMETERS, map(float, values), strict=True)) for values in sigma)
     return left, right
 
 
 def _geometry(values: Array, size: tuple[int, int]) -> StereoGeometry:
-    T_cam0_cam1 = pose(R_from_rotvec(values[EYES : EYES + 3]), values[EYES + 3 :])
+    T_cam0_cam1 = pose(R_from_rotvec(values[CAMERA_UNKNOWNS : CAMERA_UNKNOWNS + 3]), values[CAMERA_UNKNOWNS + 3 :])
     return StereoGeometry(camera_from_vector(values[:10], size), camera_from_vector(values[10:20], size), T_cam0_cam1)
 
 

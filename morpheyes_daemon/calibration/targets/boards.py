@@ -1,8 +1,8 @@
-"""Calibration boards: what they look like, where their corners are, and finding those corners in an image.
+"""Calibration boards: geometry, rendering, and corner detection in an image.
 
-Chessboards and ChArUco boards. Corners come back in the board's own order, which for a chessboard seen alone is
-known only up to a turn of the board; `aligned` settles it between the two eyes, and that is all a stereo solve
-needs. How the squares are measured is the person's business: no picture can tell the size of a square.
+Chessboards and ChArUco boards. Corners are in the board's own order, which for a chessboard in a single image is known
+only up to a rotation of the board; `aligned` makes it the same in both images, which is all a stereo solve needs. The
+size of a square must be given: no picture shows it.
 """
 
 from __future__ import annotations
@@ -18,16 +18,25 @@ import numpy as np
 from morpheyes_daemon.calibration.targets.subpixel import saddle_points
 from morpheyes_daemon.errors import UsageError
 from morpheyes_daemon.messages.core import Image
+from morpheyes_daemon.stereo.depth import grey
 from morpheyes_daemon.transforms import Array
 
 _WINDOW_SHARE = 0.3
-"""Half width of the sub-pixel window as a share of the distance to the nearest corner: the next edge stays out."""
+"""Half width of the sub-pixel window over the distance to the nearest corner; chosen: excludes the next edge."""
 _WINDOW_LIMITS_PX = (2, 11)
+"""Least and largest half width of that window, pixels; chosen: fewer pixels are noisy, more see lens distortion."""
 _REFINE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
+"""Termination of cv2.cornerSubPix: iterations and step in pixels; chosen: it only starts `saddle_points`."""
 _SQUARE_LIMITS_M = (0.001, 1.0)
+"""Accepted side of a square, metres; chosen: catches a wrong unit."""
+_CORNER_LIMITS = (3, 60)
+"""Accepted inner corners per side; chosen: what fits into an image."""
 _MARKER_SHARE = 0.75
-"""Marker side over square side of a ChArUco board when the person does not say."""
+"""Marker side over square side of a ChArUco board when it is not given; chosen: usual for printed boards."""
 _FEWEST_CHARUCO_CORNERS = 8
+"""Corners of a ChArUco board that count as found; chosen: twice those that determine a pose."""
+_LEAST_SQUARE_PX = {"chessboard": 9.0, "charuco": 22.0}
+"""Width of a square in the image that can be detected, pixels; chosen: the bits of a marker need about 2 px each."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +44,8 @@ class Board:
     """A flat board: `columns` x `rows` inner corners, `square_m` apart.
 
     A ChArUco board of (columns + 1) x (rows + 1) squares has the same inner corners; `dictionary` and
-    `marker_share` (marker side over square side) say which markers sit in its white squares.
+    `marker_share` (marker side over square side) describe the markers in its white squares.
+    Raises UsageError on an impossible board.
     """
 
     columns: int
@@ -47,11 +57,14 @@ class Board:
 
     def __post_init__(self) -> None:
         low, high = _SQUARE_LIMITS_M
-        if not min(self.columns, self.rows) >= 3 or max(self.columns, self.rows) > 60:
-            raise UsageError(f"A board of {self.columns}x{self.rows} inner corners cannot be used; give 3 to 60.")
+        fewest, most = _CORNER_LIMITS
+        if min(self.columns, self.rows) < fewest or max(self.columns, self.rows) > most:
+            raise UsageError(
+                f"A board of {self.columns}x{self.rows} inner corners cannot be used; give {fewest} to {most}."
+            )
         if not (math.isfinite(self.square_m) and low <= self.square_m <= high):
             raise UsageError(
-                f"A square of {self.square_m * 1e3:g} mm is not believable; "
+                f"A square of {self.square_m * 1e3:g} mm is out of range; "
                 f"measure one on the board and give 1 to 1000 mm."
             )
         if self.kind == "charuco" and not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
@@ -64,32 +77,32 @@ class Board:
 
     @property
     def points_m(self) -> Array:
-        """Inner corners (columns * rows, 3) in the board's frame, row by row, z = 0."""
+        """Inner corners (n, 3), n = columns * rows, in the board's frame, metres, row by row, z = 0."""
         v, u = np.mgrid[0 : self.rows, 0 : self.columns]
         flat = np.stack([u.ravel(), v.ravel(), np.zeros(u.size)], axis=-1)
         return np.asarray(flat * self.square_m, dtype=np.float64)
 
     @property
     def clear_share(self) -> float:
-        """Share of a square around a corner that holds nothing but the four squares; markers stand farther off."""
+        """Half width, over the square, of the area around a corner without markers."""
         return min(_WINDOW_SHARE, (1.0 - self.marker_share) / 2) if self.kind == "charuco" else _WINDOW_SHARE
 
     @property
     def least_square_px(self) -> float:
-        """How wide a square must be in the image to be found; a marker's bits need room."""
-        return 22.0 if self.kind == "charuco" else 9.0
+        """Width of a square in the image, pixels, from which it is detected."""
+        return _LEAST_SQUARE_PX[self.kind]
 
     @property
     def label(self) -> str:
-        """The board as `--board` takes it."""
+        """The board in the syntax of `--board`."""
         if self.kind == "charuco":
             return f"charuco:{self.columns + 1}x{self.rows + 1}:{self.dictionary}"
         return f"{self.columns}x{self.rows}"
 
     def picture(self, pixels_per_square: int, margin_squares: float = 1.0) -> tuple[Image, Array]:
-        """Return a picture of the board (H, W) and the pixel of every inner corner (columns * rows, 2) in it.
+        """Return an image (H, W) uint8 of the board and the pixels (columns * rows, 2) of its inner corners.
 
-        The margin is white paper. Used for rendering and for printing.
+        The margin is white. Used for rendering and for printing.
         """
         margin = round(margin_squares * pixels_per_square)
         columns, rows = self.columns + 1, self.rows + 1
@@ -105,7 +118,10 @@ class Board:
 
 
 def parse_board(text: str, square_m: float, marker_m: float | None = None) -> Board:
-    """Return the board of `9x6` (inner corners) or `charuco:10x7[:5X5_1000]` (squares); raises UsageError."""
+    """Return the board of `9x6` (inner corners) or `charuco:10x7[:5X5_1000]` (squares); raises UsageError.
+
+    `marker_m` is the side of a marker, None for the usual share.
+    """
     match = re.fullmatch(r"(?:(charuco):)?(\d+)x(\d+)(?::(\w+))?", text.strip())
     if not match or (match[4] and not match[1]):
         raise UsageError(
@@ -120,32 +136,27 @@ def parse_board(text: str, square_m: float, marker_m: float | None = None) -> Bo
     return Board(columns - 1, rows - 1, square_m, "charuco", (match[4] or "5X5_1000").upper(), share)
 
 
-def grey(image: Image) -> Image:
-    """Return an image (H, W) or (H, W, 3) BGR as grey (H, W)."""
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-
-
 def find_corners(image: Image, board: Board) -> Array | None:
-    """Return the inner corners (columns * rows, 2) in pixels, NaN where unseen, or None without a board.
+    """Return the inner corners (columns * rows, 2) in pixels of an image (H, W) or (H, W, 3), None without a board.
 
-    A chessboard is found whole or not at all; a ChArUco board may be partly outside or hidden.
+    A chessboard is found completely or not at all; a ChArUco board may be partly hidden (NaN).
     """
     picture = grey(image)
     return _find_charuco(picture, board) if board.kind == "charuco" else _find_chessboard(picture, board)
 
 
 def aligned(left: Array, right: Array, board: Board) -> Array:
-    """Return the right eye's chessboard corners in the left eye's order.
+    """Return the chessboard corners of the right image (n, 2) in the order of the left ones (n, 2).
 
-    The eyes look the same way up, so of the board's possible turns the one whose corner grid points the same way
-    in both images is meant. ChArUco corners carry their numbers and need none of this.
+    The cameras have the same orientation, so of the possible rotations of the board the one is chosen whose rows point
+    in the same direction in both images. ChArUco corners are numbered and are returned unchanged.
     """
     if board.kind == "charuco":
         return right
-    turns = _turns(right, board)
-    axes = [_axis(turn, board) for turn in turns]
+    rotated = _rotations(right, board)
+    axes = [_axis(corners, board) for corners in rotated]
     wanted = _axis(left, board)
-    return turns[int(np.argmax([axis @ wanted for axis in axes]))]
+    return rotated[int(np.argmax([axis @ wanted for axis in axes]))]
 
 
 def _find_chessboard(picture: Image, board: Board) -> Array | None:
@@ -176,7 +187,7 @@ def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
 
 
 def _refined(picture: Image, corners: Array, board: Board) -> Array:
-    """Move each corner to its saddle point, in a window as wide as its neighbours and the image's border allow."""
+    """Return the corners (n, 2) moved to their saddle points, in windows limited by neighbours and the border."""
     last = np.array([picture.shape[1] - 1, picture.shape[0] - 1])
     room = np.minimum(corners, last - corners).min(axis=1) - 1.0
     reach = board.clear_share * spacing_px(corners, board)
@@ -191,7 +202,7 @@ def _refined(picture: Image, corners: Array, board: Board) -> Array:
 
 
 def spacing_px(corners: Array, board: Board) -> Array:
-    """Return the distance (n,) of each corner to its nearest neighbour on the grid; NaN for an unseen corner."""
+    """Return the distance (n,) in pixels of each corner (n, 2) to its nearest neighbour, NaN where unseen."""
     grid = corners.reshape(board.rows, board.columns, 2)
     nearest = np.full(grid.shape[:2], np.inf)
     for axis in (0, 1):
@@ -206,14 +217,14 @@ def spacing_px(corners: Array, board: Board) -> Array:
 
 
 def _right_handed(corners: Array, board: Board) -> Array:
-    """Return the corners ordered so that rows run clockwise from columns, as seen by a camera before the board."""
+    """Return the corners (n, 2) in the order of a board seen from the front: rows clockwise from columns."""
     grid = corners.reshape(board.rows, board.columns, 2)
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     clockwise = along[0] * down[1] - along[1] * down[0] > 0
     return corners if clockwise else grid[::-1].reshape(-1, 2).copy()
 
 
-def _turns(corners: Array, board: Board) -> list[Array]:
+def _rotations(corners: Array, board: Board) -> list[Array]:
     grid = corners.reshape(board.rows, board.columns, 2)
     quarters = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
     return [np.rot90(grid, quarter, axes=(0, 1)).reshape(-1, 2).copy() for quarter in quarters]

@@ -1,7 +1,7 @@
-"""Finding the board in every picture of a folder: views with corners, and a sentence on each picture without.
+"""Detection of the board in every picture of a folder: views with corners, and a sentence on each picture without.
 
-A picture that cannot be used is named with a remedy and left out; the rest is kept. Corners are remembered in a file
-beside the result, so a second run over the same pictures starts at once.
+An unusable picture is named with a remedy and left out. Corners are cached in a file beside the result, so a second
+run over the same pictures is fast.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ import numpy as np
 
 from morpheyes_daemon.calibration.targets.boards import Board, aligned, find_corners
 from morpheyes_daemon.calibration.targets.image_pairs import BaselineFolder, PairFiles
-from morpheyes_daemon.calibration.targets.observations import Observations, Progress, silent
+from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import Image
+from morpheyes_daemon.progress import Progress, silent
 from morpheyes_daemon.transforms import Array
 
 _FEWEST_VIEWS = 3
-"""Views of the board below which one baseline alone says too little to be of use."""
+"""Stereo views below which a baseline is left out; chosen: fewer poses hardly average the noise of its extrinsics."""
 
 
 def observe(
@@ -36,22 +37,22 @@ def observe(
     progress: Progress = silent,
     problems: list[str] | None = None,
 ) -> Observations:
-    """Find the board in every picture; what cannot be used is named in the result's `problems`.
+    """Return the corners of `board` in every picture; unusable pictures are named in the result's `problems`.
 
-    Raises InputError when no baseline is left with enough views.
+    Raises InputError when no picture can be read or no baseline has enough views.
     """
     notes = [] if problems is None else problems
     jobs = [(number, pair) for number, folder in enumerate(folders) for pair in folder.pairs]
     seen = list(_detect(jobs, board, cache or CornerCache(None), progress))
     size = _common_size(seen, notes)
     views = [view for view in seen if view.size == size and view.found]
-    _note_blind(seen, board, notes)
+    _note_missing_boards(seen, board, notes)
     return _assembled(folders, board, size, views, notes)
 
 
 @dataclass
 class CornerCache:
-    """Corners found before, by content of the picture and board; `path` None remembers nothing."""
+    """Corners (n, 2) by hash of picture and board; stored in the file `path`, None for none."""
 
     path: Path | None
     found: dict[str, Array] = field(default_factory=dict)
@@ -66,7 +67,7 @@ class CornerCache:
             self.found = {}
 
     def save(self) -> None:
-        """Write what is known; a place that cannot be written only costs the next run its time."""
+        """Write the cache; a failure is ignored, since it only slows the next run."""
         if self.path is None:
             return
         temporary = self.path.with_name(self.path.name + ".part")
@@ -93,29 +94,29 @@ class _View:
 
 
 def _detect(jobs: list[tuple[int, PairFiles]], board: Board, cache: CornerCache, progress: Progress) -> Iterator[_View]:
-    """Yield the views in order; two threads, since OpenCV leaves the interpreter while it looks."""
+    """Yield the views in order; in threads, since OpenCV releases the interpreter lock."""
     with ThreadPoolExecutor(max_workers=os.cpu_count() or 1) as pool:
-        for done, view in enumerate(pool.map(lambda job: _see(job[0], job[1], board, cache), jobs), start=1):
+        for done, view in enumerate(pool.map(lambda job: _detect_pair(job[0], job[1], board, cache), jobs), start=1):
             progress("looking for the board", done, len(jobs))
             yield view
     cache.save()
 
 
-def _see(baseline: int, pair: PairFiles, board: Board, cache: CornerCache) -> _View:
+def _detect_pair(baseline: int, pair: PairFiles, board: Board, cache: CornerCache) -> _View:
     found: dict[str, Array | None] = {"left": None, "right": None}
     sizes = []
-    for eye, path in (("left", pair.left), ("right", pair.right)):
+    for side, path in (("left", pair.left), ("right", pair.right)):
         if path is None:
             continue
-        half = eye if pair.side_by_side else ""
+        half = side if pair.side_by_side else ""
         corners, size, problem = _corners_in(path, half, board, cache)
         if problem:
             return _View(baseline, pair, None, None, None, problem)
-        found[eye] = corners
+        found[side] = corners
         sizes.append((size, path))
     if len({size for size, _ in sizes}) > 1:
         (a, _), (b, path) = sizes
-        text = f"{path}: is {b[0]}x{b[1]} px but its left eye {a[0]}x{a[1]}; take the pair again at one size."
+        text = f"{path}: is {b[0]}x{b[1]} px but its left picture {a[0]}x{a[1]}; take the pair again at one size."
         return _View(baseline, pair, None, None, None, text)
     left, right = found["left"], found["right"]
     if left is not None and right is not None:
@@ -126,7 +127,7 @@ def _see(baseline: int, pair: PairFiles, board: Board, cache: CornerCache) -> _V
 def _corners_in(
     path: Path, half: str, board: Board, cache: CornerCache
 ) -> tuple[Array | None, tuple[int, int], str | None]:
-    """Return the corners, the size of one eye's picture, and a sentence when it cannot be read."""
+    """Return corners, size (w, h) of one camera's image, and a sentence when the picture cannot be read."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -139,9 +140,9 @@ def _corners_in(
     image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if content else None
     if image is None:
         return None, (0, 0), f"{path}: is not a readable picture; copy it again or remove it."
-    eye = _half(np.asarray(image, dtype=np.uint8), half)
-    size = (eye.shape[1], eye.shape[0])
-    corners = find_corners(eye, board)
+    picture = _half(np.asarray(image, dtype=np.uint8), half)
+    size = (picture.shape[1], picture.shape[0])
+    corners = find_corners(picture, board)
     cache.found[key] = np.vstack([np.empty((0, 2)) if corners is None else corners, [size]])
     return corners, size, None
 
@@ -170,11 +171,11 @@ def _common_size(seen: list[_View], problems: list[str]) -> tuple[int, int]:
     return size
 
 
-def _note_blind(seen: list[_View], board: Board, problems: list[str]) -> None:
+def _note_missing_boards(seen: list[_View], board: Board, problems: list[str]) -> None:
     for view in seen:
         if view.size is not None and not view.found:
             path = view.pair.left or view.pair.right
-            problems.append(f"{path}: no {board.label} board is found; retake it, the whole board sharp and lit.")
+            problems.append(f"{path}: no {board.label} board is found; retake it with the complete board sharp and lit.")
 
 
 def _assembled(

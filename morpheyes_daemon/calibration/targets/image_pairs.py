@@ -1,7 +1,7 @@
-"""Which files of a folder belong together: one sub-folder per baseline, left and right by name and number.
+"""Grouping of the files of a folder: one sub-folder per baseline, left and right by name and number.
 
-`100mm`, `122.2mm` and so on, or a folder of pictures alone for a fixed rig; side-by-side pictures are told by their
-shape. What cannot be used is named with a remedy and left out. No picture is searched for a board here.
+Sub-folders are named `100mm`, `122.2mm` and so on; a folder of pictures alone is a fixed rig. Side-by-side pictures
+are recognized by their aspect ratio. Unusable files are named with a remedy and left out. Boards are not searched here.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from morpheyes_daemon.messages.core import Image
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 _SIDE_BY_SIDE_ASPECT = 1.9
-"""Width over height from which a picture must hold both eyes."""
+"""Aspect ratio from which a picture is side by side; chosen: twice 4:3 is 2.67, a single 16:9 picture 1.78."""
 
 
 @dataclass(frozen=True)
 class PairFiles:
-    """The files of one stereo picture; one path twice means side by side, None that this eye is missing."""
+    """The files of one stereo pair; the same path twice for a side-by-side picture, None for a missing one."""
 
     left: Path | None
     right: Path | None
 
     @property
     def side_by_side(self) -> bool:
-        """Both eyes are in one file."""
+        """Whether both images are in one file."""
         return self.left is not None and self.left == self.right
 
 
 @dataclass(frozen=True)
 class BaselineFolder:
-    """The pictures taken at one baseline; `nominal_m` is None for a fixed rig whose folder names no length."""
+    """The pictures of one baseline; `nominal_m` is None for a fixed rig whose folder names no baseline."""
 
     nominal_m: float | None
     folder: Path
@@ -44,9 +44,9 @@ class BaselineFolder:
 
 
 def read_folder(root: Path) -> tuple[list[BaselineFolder], list[str]]:
-    """Return the baseline folders under `root` in growing order, and a sentence on everything left out.
+    """Return the baseline folders under `root`, sorted by baseline, and a sentence on everything left out.
 
-    Raises InputError when there is nothing to calibrate from, or two folders claim the same baseline.
+    Raises InputError when there are no pairs, a camera has no picture, or two folders have the same baseline.
     """
     if not root.is_dir():
         raise InputError(f"{root}: is not a folder; give the folder that holds the board pictures.")
@@ -67,7 +67,7 @@ def read_folder(root: Path) -> tuple[list[BaselineFolder], list[str]]:
 
 
 def read_pair(files: PairFiles) -> tuple[Image, Image]:
-    """Return both pictures (H, W, 3) of a pair; raises InputError naming the file that cannot be read."""
+    """Return both images (H, W, 3) BGR of a pair; raises InputError naming the file that cannot be read."""
     pictures = []
     for path in (files.left, files.right):
         image = None if path is None else cv2.imread(str(path), cv2.IMREAD_COLOR)
@@ -81,7 +81,7 @@ def read_pair(files: PairFiles) -> tuple[Image, Image]:
 
 
 def nominal_from_name(path: Path) -> float | None:
-    """Return the baseline in metres that a folder's name tells, None when it is no such folder."""
+    """Return the baseline in metres of a folder named like `100mm`, None for any other path."""
     return _length_m(path.name) if path.is_dir() else None
 
 
@@ -96,7 +96,7 @@ def _refuse_duplicates(named: list[tuple[float, Path]]) -> None:
         twin = by_length.setdefault(round(length * 1e5), path)
         if twin != path:
             raise InputError(
-                f"{path}: claims the same baseline as {twin.name}; keep one of them, or rename it to its own length."
+                f"{path}: has the same baseline as {twin.name}; keep one of them, or rename it to its own baseline."
             )
 
 
@@ -107,23 +107,23 @@ def _baseline_folder(folder: Path, nominal_m: float | None, problems: list[str])
     if not pairs:
         problems.append(f"{folder}: holds no stereo pictures; take them at this baseline, or remove the folder.")
     elif all(pair.right is None for pair in pairs) or all(pair.left is None for pair in pairs):
-        eye = "right" if pairs[0].right is None else "left"
-        raise InputError(f"{folder}: has no {eye} picture at all; copy the {eye}*.png files there.")
+        side = "right" if pairs[0].right is None else "left"
+        raise InputError(f"{folder}: has no {side} picture at all; copy the {side}*.png files there.")
     return BaselineFolder(nominal_m, folder, tuple(pairs))
 
 
 def _left_right(files: list[Path], problems: list[str]) -> list[PairFiles]:
-    eyes: dict[str, dict[int, Path]] = {"left": {}, "right": {}}
+    found: dict[str, dict[int, Path]] = {"left": {}, "right": {}}
     for path in files:
-        eye = "left" if path.name.lower().startswith("left") else "right"
+        side = "left" if path.name.lower().startswith("left") else "right"
         number = int(digits[-1]) if (digits := re.findall(r"\d+", path.stem)) else -1
-        if number in eyes[eye]:
-            problems.append(f"{path}: has the same number as {eyes[eye][number].name} and is left out; renumber it.")
+        if number in found[side]:
+            problems.append(f"{path}: has the same number as {found[side][number].name} and is left out; renumber it.")
             continue
-        eyes[eye][number] = path
+        found[side][number] = path
     pairs = []
-    for number in sorted(eyes["left"].keys() | eyes["right"].keys()):
-        left, right = eyes["left"].get(number), eyes["right"].get(number)
+    for number in sorted(found["left"].keys() | found["right"].keys()):
+        left, right = found["left"].get(number), found["right"].get(number)
         if left is None or right is None:
             alone, other = (left, "right") if right is None else (right, "left")
             problems.append(f"{alone}: has no {other} picture of the same number; copy it there or retake the pair.")

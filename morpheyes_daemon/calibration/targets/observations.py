@@ -1,8 +1,7 @@
-"""The corners of one board in many stereo views at many baselines: all that a solve is given."""
+"""The corners of one board in many stereo views at many baselines: the input of a solve."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,20 +10,13 @@ from numpy.typing import NDArray
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.transforms import Array
 
-Progress = Callable[[str, int, int], None]
-"""Told what is being done, how much is done, and of how much."""
-
-
-def silent(_what: str, _done: int, _total: int) -> None:
-    """Show no progress."""
-
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Corners of one board seen by both eyes in V views at M baselines.
+    """Corners of one board seen by both cameras in V views at M baselines.
 
-    `left`, `right` (V, N, 2) are pixels, NaN where that eye did not see the corner; `baseline` (V,) counts into
-    `nominal_m` (M,), which grows (NaN for a fixed rig of unknown length); `names` are the file names of each view.
+    `left`, `right` (V, N, 2) are pixels, NaN where that camera did not see the corner; `baseline` (V,) indexes
+    `nominal_m` (M,), which is increasing (NaN for a fixed rig of unknown baseline); `names` are the files of each view.
     `problems` are sentences on pictures left out, `lost` those on whole baselines.
     """
 
@@ -44,7 +36,7 @@ class Observations:
         return len(self.baseline)
 
     def subset(self, keep: NDArray[np.bool_]) -> Observations:
-        """Return the chosen views (V,) only; baselines keep their numbers."""
+        """Return the views with a True in `keep` (V,); baselines keep their indices."""
         names = tuple(name for name, kept in zip(self.names, keep, strict=True) if kept)
         return Observations(
             self.board,
@@ -59,7 +51,7 @@ class Observations:
         )
 
     def at_baselines(self, chosen: list[int]) -> Observations:
-        """Return only the views of the chosen baselines, which are numbered anew."""
+        """Return the views of the baselines with the indices `chosen`, which are renumbered from 0."""
         kept = self.subset(np.isin(self.baseline, chosen))
         renumbered = np.searchsorted(np.array(chosen), kept.baseline)
         return Observations(

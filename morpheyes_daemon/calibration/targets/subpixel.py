@@ -1,9 +1,9 @@
-"""Corners of black and white squares to a hundredth of a pixel: fit a saddle surface and take its stationary point.
+"""Sub-pixel corners of black and white squares: the stationary point of a fitted saddle surface.
 
 Around a corner the blurred image is a saddle; a quadratic fitted to it under a cone-shaped weight has its stationary
 point at the corner whatever the pixel phase (Lucchese and Mitra, "Using saddle points for subpixel feature detection
 in camera calibration targets", 2002). On boards of the camera twin this errs by 0.02 px rms where OpenCV's
-cornerSubPix errs by 0.05. It needs a start within a pixel or two and no neighbouring corner within its window.
+cornerSubPix errs by 0.05. It needs a start within two pixels and no other corner within its window.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.transforms import Array
 
-_ROUNDS = 5
-_LONGEST_STEP_PX = 1.0
+_ROUNDS, _LONGEST_STEP_PX = 5, 1.0
+"""Newton steps, and the longest one in pixels; chosen: five steps cover _FARTHEST_PX and converge."""
 _FARTHEST_PX = 2.0
-"""A fit that leaves its start this far found something else."""
+"""Distance from the start, pixels, beyond which another feature was found; chosen: the accuracy of the detectors."""
 
 
 def saddle_points(image: Image, start: Array, half_window: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Return refined corners (n, 2) and which of them converged; the others keep their start.
+    """Return refined corners (n, 2) and which (n,) converged; the others keep their start (n, 2).
 
-    `image` is grey (H, W); `half_window` is in pixels.
+    `image` is grey (H, W) uint8; `half_window` is in pixels (Lucchese and Mitra 2002).
     """
     picture = image.astype(np.float32)
     offsets, fit = _quadratic(half_window)

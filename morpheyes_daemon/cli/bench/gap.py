@@ -1,4 +1,4 @@
-"""`morpheyes bench gap` and `gap-images`: how fast and how well gaps are found."""
+"""`morpheyes bench gap` and `gap-images`: speed and accuracy of gap detection."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Annotated
 
 import typer
 
-from morpheyes_daemon.cli.terminal.figures import say, times_text
+from morpheyes_daemon.cli.terminal.figures import print_figures, times_text
 
 
 def gap(
     size: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")] = "640x480",
-    repeats: Annotated[int, typer.Option(min=3, help="Views, of walls with every shape of opening.")] = 24,
+    repeats: Annotated[int, typer.Option(min=3, help="Number of views, of walls with every shape of opening.")] = 24,
     calibration: Annotated[str, typer.Option(help="'solved', 'mounted', 'exact', or a calibration file.")] = "solved",
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON and nothing else.")] = False,
 ) -> None:
@@ -33,20 +33,20 @@ def gap(
     rows = [
         ("images", f"{found.size}, {found.views} views"),
         ("detection", times_text(found.detection)),
-        ("of the processor", times_text(found.detection_cpu)),
+        ("processor time", times_text(found.detection_cpu)),
         ("depth", times_text(found.depth)),
         ("by stacked flow", times_text(found.flow)),
         ("ratio", f"{found.ratio:.0f} without the depth, {found.ratio_with_depth:.1f} with it"),
         ("contour IoU", f"{found.contour_iou:.3f}; by flow {found.flow_iou:.3f} (medians)"),
     ]
-    say(asdict(found), rows, as_json)
+    print_figures(asdict(found), rows, as_json)
 
 
 def gap_images(
-    data: Annotated[Path | None, typer.Option(help="Folder of real images; default MORPHEYES_DATA.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of real images; default: MORPHEYES_DATA.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON and nothing else.")] = False,
 ) -> None:
-    """Find the gap in GapFlyt's real frames and compare its contour with masks drawn by hand."""
+    """Detect the gap in GapFlyt's real frames and compare its contour with masks drawn by hand."""
     from morpheyes_daemon.benchmarks.gap_on_real_images import gap_images as judge_images
 
     found = judge_images(data or Path(os.environ.get("MORPHEYES_DATA", "../shared/data")))

@@ -1,4 +1,4 @@
-"""`morpheyes bench`: how fast and how steady the daemon and the simulator are on this machine."""
+"""`morpheyes bench`: speed and stick timing of the daemon and the simulator on this machine."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from morpheyes_daemon.cli.bench.gap import gap, gap_images
-from morpheyes_daemon.cli.terminal.figures import say, times_text
+from morpheyes_daemon.cli.terminal.figures import print_figures, times_text
 from morpheyes_daemon.cli.terminal.progress import progress_line
 
 if TYPE_CHECKING:
     from morpheyes_daemon.flights.lockstep import FlightPlan, Progress
 
-app = typer.Typer(help="Time the sticks, the depth and the renderer on this machine.", no_args_is_help=True)
+app = typer.Typer(help="Measure stick timing, depth, rendering and take-over on this machine.", no_args_is_help=True)
 
 Size = Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT in pixels (4:3).")]
-Repeats = Annotated[int, typer.Option(min=3, help="Timed runs; the first two are warm-up and left out.")]
+Repeats = Annotated[int, typer.Option(min=3, help="Timed runs; the first two are warm-up and do not count.")]
 Calibration = Annotated[str, typer.Option(help="'solved', 'mounted', 'exact', or a calibration file.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the figures as JSON and nothing else.")]
 
@@ -26,13 +26,17 @@ app.command()(gap)
 app.command("gap-images")(gap_images)
 
 LIMIT_P99_S, LIMIT_MAX_S = 0.025, 0.100
+"""Limits of the interval between stick messages, seconds; chosen: 1.25 periods of 20 ms, and a tenth of the second after
+which ArduPilot drops overrides."""
 LIMIT_GROWTH_PCT = 5.0
+"""Limit of the memory growth; chosen: above the noise of the allocator."""
 ATTACK_P99_S, LATEST_STICK_S = 0.002, 0.060
+"""Seconds; chosen: a tenth of a stick period more than in quiet time, and three periods."""
 
 
 @app.command()
 def sticks(
-    minutes: Annotated[float, typer.Option(min=0.1, help="After engaging.")] = 10.0,
+    minutes: Annotated[float, typer.Option(min=0.1, help="Minutes after engaging.")] = 10.0,
     size: Size = "640x480",
     rate_hz: Annotated[float, typer.Option(min=0.2, max=60.0, help="Stereo pairs per second.")] = 5.0,
     calibration: Calibration = "solved",
@@ -40,8 +44,8 @@ def sticks(
 ) -> None:
     """Measure the time between stick messages in real time under full vision load.
 
-    Exit code 1 when p99 is above 25 ms or any interval above 100 ms. On a virtual machine the host may take the
-    processor away; intervals in which it took none are listed apart.
+    Exit code 1 when p99 is above 25 ms or any interval above 100 ms. On a virtual machine the host may take
+    processor time; intervals in which it took none are listed separately.
     """
     from morpheyes_daemon.benchmarks.soak import bench_sticks
 
@@ -49,14 +53,14 @@ def sticks(
     found = _live(as_json, lambda show: bench_sticks(plan, minutes, show))
     beat = found.beat
     rows = [
-        ("stick messages", f"{beat.count} in {found.minutes:g} minutes, {found.frames} frames seen"),
+        ("stick messages", f"{beat.count} in {found.minutes:g} minutes, {found.frames} frames processed"),
         ("interval", _beat(beat.p50_s, beat.p99_s, beat.max_s)),
         ("loop lateness", f"{found.worst_lateness_ms:.1f} ms at worst"),
-        ("taken by the host", f"{beat.stolen_s:.1f} s of processor time, on a virtual machine"),
-        ("while it took none", f"{beat.own_count}: p99 {_ms(beat.own_p99_s)}, largest {_ms(beat.own_max_s)}"),
+        ("stolen time", f"{beat.stolen_s:.1f} s of processor time, on a virtual machine"),
+        ("without stolen time", f"{beat.own_count}: p99 {_ms(beat.own_p99_s)}, largest {_ms(beat.own_max_s)}"),
         ("at the end", found.final_state),
     ]
-    say(asdict(found), rows, as_json)
+    print_figures(asdict(found), rows, as_json)
     if beat.p99_s > LIMIT_P99_S or beat.max_s > LIMIT_MAX_S:
         raise typer.Exit(1)
 
@@ -86,7 +90,7 @@ def attack(
         )
         for row in found
     ]
-    say({"rows": [row.as_json() for row in found]}, rows, as_json)
+    print_figures({"rows": [row.as_json() for row in found]}, rows, as_json)
     late = [row for row in found if row.attacked_max_s > max(LATEST_STICK_S, row.timer_max_s)]
     if late or any(row.attacked_p99_s > row.quiet_p99_s + ATTACK_P99_S for row in found):
         raise typer.Exit(1)
@@ -94,12 +98,12 @@ def attack(
 
 @app.command()
 def soak(
-    minutes: Annotated[float, typer.Option(min=0.2, help="After engaging.")] = 60.0,
+    minutes: Annotated[float, typer.Option(min=0.2, help="Minutes after engaging.")] = 60.0,
     size: Size = "640x480",
     calibration: Calibration = "solved",
     as_json: AsJson = False,
 ) -> None:
-    """Run in real time for long and look for what grows.
+    """Fly in real time for a long time and look for leaks.
 
     Exit code 1 when memory grew by 5 % or a task, thread or descriptor leaked.
     """
@@ -118,7 +122,7 @@ def soak(
         ("worker restarts", str(found.worker_restarts)),
         ("stick interval", f"p99 {found.p99_s * 1e3:.1f} ms, largest {found.max_s * 1e3:.1f} ms"),
     ]
-    say(found.as_json(), rows, as_json)
+    print_figures(found.as_json(), rows, as_json)
     leaked = max(found.leaked_tasks, found.leaked_threads, found.leaked_descriptors)
     if found.memory_growth_pct >= LIMIT_GROWTH_PCT or leaked > 0:
         raise typer.Exit(1)
@@ -128,7 +132,7 @@ def soak(
 def depth(
     size: Size = "640x480", repeats: Repeats = 30, calibration: Calibration = "exact", as_json: AsJson = False
 ) -> None:
-    """Time a depth map beside OpenCV's own matcher on the same pairs."""
+    """Time a depth map beside OpenCV's matcher on the same pairs."""
     from morpheyes_daemon.benchmarks.vision_latency import bench_depth
 
     plan = _plan(size, calibration, 5.0, 1.0)
@@ -140,14 +144,14 @@ def depth(
         ("StereoSGBM", times_text(found.opencv)),
         ("ratio", f"{found.ratio:.2f} of the medians"),
     ]
-    say(asdict(found), rows, as_json)
+    print_figures(asdict(found), rows, as_json)
 
 
 @app.command()
 def latency(
     size: Size = "640x480", repeats: Repeats = 50, calibration: Calibration = "exact", as_json: AsJson = False
 ) -> None:
-    """Time frames through the vision worker, beside the latency that lockstep reckons with."""
+    """Time frames through the vision worker, beside the latency that lockstep assumes."""
     from morpheyes_daemon.benchmarks.vision_latency import bench_latency
 
     plan = _plan(size, calibration, 5.0, 1.0)
@@ -155,10 +159,10 @@ def latency(
         found = bench_latency(plan, repeats, report)
     rows = [
         ("frame to percept", times_text(found.latency)),
-        ("of that computing", times_text(found.compute)),
+        ("of it computation", times_text(found.compute)),
         ("configured", f"{found.configured_ms:g} ms (stereo.latency_ms)"),
     ]
-    say(asdict(found), rows, as_json)
+    print_figures(asdict(found), rows, as_json)
 
 
 @app.command()
@@ -168,9 +172,9 @@ def takeover(
     calibration: Calibration = "exact",
     as_json: AsJson = False,
 ) -> None:
-    """Measure how soon the pilot has the sticks, by switch and by mode, in lockstep forest flights.
+    """Measure the take-over latency, by switch and by mode, in lockstep forest flights.
 
-    Exit code 1 when one release came later than 50 ms after the pilot's message, or a stick was held after it.
+    Exit code 1 when a release came later than 50 ms after the pilot's message, or a stick was overridden after it.
     """
     from morpheyes_daemon.fault_injection.takeover_latency import bench_takeover
 
@@ -178,11 +182,11 @@ def takeover(
     with progress_line() as report:
         found = bench_takeover(plan, trials, report)
     rows = [
-        ("take-overs", f"{found.trials}, {found.failed} failed, {found.held_after} sticks held after the release"),
+        ("take-overs", f"{found.trials}, {found.failed} failed, {found.held_after} sticks overridden after the release"),
         ("message to release", f"{found.arrival_to_release_max_ms:.1f} ms at most"),
         *((f"{way} to release", _hand(times)) for way, times in found.hand_to_release_ms.items()),
     ]
-    say(asdict(found), rows, as_json)
+    print_figures(asdict(found), rows, as_json)
     if found.failed:
         raise typer.Exit(1)
 
@@ -195,7 +199,7 @@ def render(size: Size = "640x480", repeats: Repeats = 20, as_json: AsJson = Fals
     plan = _plan(size, "exact", 5.0, 1.0)
     with progress_line() as report:
         found = bench_render(plan, repeats, report)
-    say({"size": size, **asdict(found)}, [("stereo pair", times_text(found))], as_json)
+    print_figures({"size": size, **asdict(found)}, [("stereo pair", times_text(found))], as_json)
 
 
 def _plan(size: str, calibration: str, rate_hz: float, minutes: float) -> FlightPlan:

@@ -1,4 +1,4 @@
-"""`morpheyes calibrate`: from pictures of a board to a calibration file, and whether it is any good."""
+"""`morpheyes calibrate solve`, `report`, `render` and `evaluate`: the commands that need no rig."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from morpheyes_daemon.cli.calibrate.options import (
     MarkerOption,
     SquareOption,
     ViewsOption,
-    _size,
     choose_baselines_m,
     choose_board,
+    parse_image_size,
 )
 from morpheyes_daemon.stereo.calibration_file import read_calibration
 
 if TYPE_CHECKING:
-    from morpheyes_daemon.calibration.solver.result import Solved
+    from morpheyes_daemon.benchmarks.calibration_error import RigTruth
+    from morpheyes_daemon.calibration.solver.result import CalibrationResult
 
 app = typer.Typer(help="Calibrate the stereo rig and check it.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -62,12 +63,18 @@ def solve(
 def report(
     file: Annotated[Path, typer.Argument(help="Calibration file.")],
     out: Annotated[Path | None, typer.Option("--out", help="Page to write, .html or .png.")] = None,
-    matcher_px: Annotated[float, typer.Option("--matcher-px", min=0.01, max=5, help="Matcher, 1 sigma.")] = 0.25,
-    servo_mm: Annotated[float, typer.Option("--servo-mm", min=0, max=5, help="Servo repeatability, 1 sigma.")] = 0.1,
-    sync_ms: Annotated[float, typer.Option("--sync-ms", min=0, max=100, help="Time between the eyes.")] = 2.0,
+    matcher_px: Annotated[
+        float, typer.Option("--matcher-px", min=0.01, max=5, help="Matcher noise, one sigma, px.")
+    ] = 0.25,
+    servo_mm: Annotated[
+        float, typer.Option("--servo-mm", min=0, max=5, help="Servo repeatability, one sigma, mm.")
+    ] = 0.1,
+    sync_ms: Annotated[
+        float, typer.Option("--sync-ms", min=0, max=100, help="Time offset between the cameras, ms.")
+    ] = 2.0,
     sideways_m_s: Annotated[float, typer.Option("--sideways", min=0, max=20, help="Sideways speed, m/s.")] = 0.5,
 ) -> None:
-    """Write a page that shows how good a calibration is, what depth errors to expect, and what to retake."""
+    """Write a report of a calibration: its quality, the depth errors to expect, and the pictures to retake."""
     from morpheyes_daemon.calibration.report.depth_error_budget import Conditions
     from morpheyes_daemon.calibration.report.html import write_report
 
@@ -81,20 +88,20 @@ def report(
 def render(
     out: Annotated[Path, typer.Argument(help="New folder for the pictures.")],
     baselines_mm: Annotated[
-        str, typer.Option("--baselines", help="How many, equally spaced over 100-300 mm, or lengths such as 100,200.")
+        str, typer.Option("--baselines", help="Number of baselines over 100-300 mm, or lengths in mm such as 100,200.")
     ] = "10",
     views: ViewsOption = None,
     mount: Annotated[
-        bool, typer.Option("--mount", help="A board on a wall, the vehicle turned by hand: for `mount`.")
+        bool, typer.Option("--mount", help="Fixed board, vehicle rotated by hand: for `calibrate mount`.")
     ] = False,
-    visits: Annotated[bool, typer.Option("--visits", help="The servo goes away and back before every pair.")] = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Which twin rig.")] = 0,
+    visits: Annotated[bool, typer.Option("--visits", help="Move the servo away and back before every pair.")] = False,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulated rig.")] = 0,
     size: Annotated[str, typer.Option("--size", help="Image size, WIDTHxHEIGHT.")] = "640x480",
     board: BoardOption = None,
     square_mm: SquareOption = None,
     marker_mm: MarkerOption = None,
 ) -> None:
-    """Render boards before the simulator's camera, as folders that `solve` takes."""
+    """Render boards in front of the simulated cameras, as folders for `calibrate solve`."""
     from morpheyes_daemon.calibration.mount import MOUNT_VIEWS
     from morpheyes_daemon.calibration.targets.capture_guide import BASELINE_VIEWS
     from morpheyes_daemon.cli.terminal.progress import progress_line
@@ -105,16 +112,16 @@ def render(
     )
     from morpheyes_daemon.simulation.camera.true_rig import RANGE_M
 
-    usual = {"board": DEFAULT_BOARD.label, "square_mm": 25.0}
-    chosen = choose_board(usual, board, square_mm, marker_mm, checked=False)
+    usual = {"board": DEFAULT_BOARD.label, "square_mm": 25.0 if square_mm is None else square_mm}
+    chosen = choose_board(usual, board, square_mm, marker_mm)
     if mount:
         with progress_line() as progress:
-            render_mount_folder(out, seed, views or MOUNT_VIEWS, chosen, _size(size), progress)
+            render_mount_folder(out, seed, views or MOUNT_VIEWS, chosen, parse_image_size(size), progress)
         typer.echo(f"{views or MOUNT_VIEWS} pairs and attitudes: {out}; next: morpheyes calibrate mount FILE {out}")
         return
     nominal_m = choose_baselines_m(baselines_mm, RANGE_M)
     with progress_line() as progress:
-        render_folder(out, seed, nominal_m, views or BASELINE_VIEWS, chosen, _size(size), visits, progress)
+        render_folder(out, seed, nominal_m, views or BASELINE_VIEWS, chosen, parse_image_size(size), visits, progress)
     typer.echo(
         f"{len(nominal_m)} baselines, {views or BASELINE_VIEWS} pairs each: {out}; next: morpheyes calibrate solve {out}"
     )
@@ -123,16 +130,19 @@ def render(
 @app.command()
 def evaluate(
     file: Annotated[Path, typer.Argument(help="Calibration file solved from rendered boards.")],
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Which twin; default: the file's own.")] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="Seed of the simulated rig; default: that of the file.")
+    ] = None,
     separate: Annotated[
-        Path | None, typer.Option("--separate", help="The rendered folder: also solve every baseline by itself.")
+        Path | None, typer.Option("--separate", help="Folder of rendered boards: also solve every baseline separately.")
     ] = None,
     watch: Annotated[
-        bool, typer.Option("--watch", help="Also bend the twin, and let its eyes expose late, before the drift watch.")
+        bool,
+        typer.Option("--watch", help="Also run the extrinsics monitor on a bent rig and on time offsets."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare a solved file with the truth of the simulator's rig, at 41 baselines."""
+    """Compare a solved file with the ground truth of the simulated rig, at 41 baselines."""
     from morpheyes_daemon.benchmarks.calibration_error import compare_separate, evaluate_rig, twin_of
     from morpheyes_daemon.cli.terminal.progress import progress_line
 
@@ -157,8 +167,16 @@ def evaluate(
     if as_json:
         typer.echo(json.dumps(figures, indent=2))
         return
+    _print_truth(truth)
+    if watch:
+        _print_watch(figures["watch"])
+    for name, row in figures.get("at_calibrated_baselines", {}).items():
+        typer.echo(f"{name}: " + ", ".join(f"{key} {value}" for key, value in row.items()))
+
+
+def _print_truth(truth: RigTruth) -> None:
     _print_table(
-        ("baseline", "rows median", "rows 95 %", "length error", "disparity bias"),
+        ("baseline", "row error, median", "row error, 95 %", "length error", "disparity bias"),
         [
             (
                 f"{row.nominal_mm:g} mm",
@@ -175,14 +193,12 @@ def evaluate(
         f"within {truth.baseline_error_max_mm:.3f} mm; disparity bias within {truth.disparity_bias_max_px:.3f} px"
     )
     near, far = truth.pointing_error_deg
-    typer.echo(f"left eye believed to point {near:.2f} degrees aside at the smallest baseline, {far:.2f} at the largest")
-    if watch:
-        _print_watch(figures["watch"])
-    for name, row in figures.get("at_calibrated_baselines", {}).items():
-        typer.echo(f"{name}: " + ", ".join(f"{key} {value}" for key, value in row.items()))
+    typer.echo(
+        f"pointing error of the left camera {near:.2f} degrees at the smallest baseline, {far:.2f} at the largest"
+    )
 
 
-def _print_solved(solved: Solved, out: Path) -> None:
+def _print_solved(solved: CalibrationResult, out: Path) -> None:
     calibration = solved.calibration
     rows = []
     for index, nominal in enumerate(calibration.nominal_m):
@@ -202,10 +218,10 @@ def _print_solved(solved: Solved, out: Path) -> None:
         typer.echo(f"outlier: {outlier.name} ({outlier.rms_px:.2f} px)")
     for problem in solved.problems:
         typer.echo(f"left out: {problem}", err=True)
-    for advice in solved.verdict.retake:
-        typer.echo(f"to do better: {advice}")
-    typer.echo(f"{solved.verdict.text}")
-    typer.echo(f"written: {out}; look at it with: morpheyes calibrate report {out}")
+    for advice in solved.acceptance.retake:
+        typer.echo(f"advice: {advice}")
+    typer.echo(f"{solved.acceptance.text}")
+    typer.echo(f"written: {out}; report: morpheyes calibrate report {out}")
 
 
 def _print_watch(figures: dict[str, Any]) -> None:
@@ -219,7 +235,7 @@ def _print_watch(figures: dict[str, Any]) -> None:
     )
     for late in figures["late"]:
         measured = f"{late['measured_ms']:.2f} ± {late['sigma_ms']:.2f} ms"
-        typer.echo(f"right eye {late['true_ms']:g} ms late: measured {measured}")
+        typer.echo(f"right camera {late['true_ms']:g} ms after the left one: measured {measured}")
 
 
 def _print_table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:

@@ -1,4 +1,4 @@
-"""Options that the calibrate commands share, and what they mean."""
+"""Options that the calibrate commands share, and their interpretation."""
 
 from __future__ import annotations
 
@@ -16,9 +16,11 @@ def choose_board(
     square_mm: float | None,
     marker_mm: float | None,
     ask: bool = False,
-    checked: bool = True,
 ) -> Board:
-    """Return the board from the options or else from what the folder says; raises UsageError when they disagree."""
+    """Return the board of the options, else of `known`, the content of board.yaml.
+
+    `ask` allows a prompt for a missing square size. Raises UsageError when the size is missing or both disagree.
+    """
     from morpheyes_daemon.calibration.targets.boards import parse_board
     from morpheyes_daemon.errors import UsageError
 
@@ -27,7 +29,7 @@ def choose_board(
         square_mm = typer.prompt("Side of one square in mm, measured over several squares", type=float)
     if square_mm is None and written is None:
         raise UsageError("The size of the squares is missing; measure one and give it, such as --square-mm 25.")
-    if checked and square_mm is not None and written is not None and abs(square_mm / float(written) - 1) > 1e-3:
+    if square_mm is not None and written is not None and abs(square_mm / float(written) - 1) > 1e-3:
         raise UsageError(f"--square-mm {square_mm:g} and board.yaml ({written:g} mm) disagree; correct one of them.")
     side_mm = float(written if square_mm is None else square_mm)
     marker = known.get("marker_mm") if marker_mm is None else marker_mm
@@ -36,7 +38,10 @@ def choose_board(
 
 
 def choose_baselines_m(text: str, range_m: tuple[float, float]) -> list[float]:
-    """Return the nominal baselines of `--baselines`: a number of them, or lengths in mm; raises UsageError."""
+    """Return the nominal baselines of `--baselines`, metres: a number of them over the range, or lengths in mm.
+
+    Raises UsageError for anything else.
+    """
     import numpy as np
 
     from morpheyes_daemon.errors import UsageError
@@ -55,7 +60,8 @@ def choose_baselines_m(text: str, range_m: tuple[float, float]) -> list[float]:
     return [round(number / 1e3, 4) for number in sorted(numbers)]
 
 
-def _size(text: str) -> tuple[int, int]:
+def parse_image_size(text: str) -> tuple[int, int]:
+    """Return (width, height) in pixels of WIDTHxHEIGHT; raises UsageError for anything else."""
     from morpheyes_daemon.errors import UsageError
 
     width, _, height = text.lower().partition("x")
@@ -69,10 +75,12 @@ BoardOption = Annotated[
 ]
 
 
-SquareOption = Annotated[float | None, typer.Option("--square-mm", help="Side of one square, measured.")]
+SquareOption = Annotated[float | None, typer.Option("--square-mm", help="Measured side of one square, mm.")]
 
 
-MarkerOption = Annotated[float | None, typer.Option("--marker-mm", help="Side of one marker of a ChArUco board.")]
+MarkerOption = Annotated[
+    float | None, typer.Option("--marker-mm", help="Measured side of one marker of a ChArUco board, mm.")
+]
 
 
 ViewsOption = Annotated[

@@ -1,1 +1,1 @@
-"""What commands share: progress, figures, optional extras, the line of a flight."""
+"""Terminal output shared by commands: progress, figures, checks for extras, the progress line of a flight."""

@@ -1,4 +1,4 @@
-"""Optional packages: a command that needs some asks here first, so that their absence is one sentence."""
+"""Checks for optional packages, so that their absence is reported in one sentence."""
 
 from __future__ import annotations
 

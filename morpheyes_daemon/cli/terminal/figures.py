@@ -1,4 +1,4 @@
-"""How figures that were measured are said: rows for a person, or JSON and nothing else."""
+"""Output of measured figures: rows for a person, or JSON and nothing else."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from morpheyes_daemon.benchmarks.vision_latency import Times
 
 
-def say(document: dict[str, Any], rows: Sequence[tuple[str, str]], as_json: bool) -> None:
-    """Print `document` as JSON, or `rows` of a name and what is to be said of it."""
+def print_figures(document: dict[str, Any], rows: Sequence[tuple[str, str]], as_json: bool) -> None:
+    """Print `document` as JSON, or `rows` of name and value."""
     if as_json:
         typer.echo(json.dumps(document, indent=2))
         return
@@ -22,6 +22,6 @@ def say(document: dict[str, Any], rows: Sequence[tuple[str, str]], as_json: bool
 
 
 def times_text(times: Times) -> str:
-    """Return median, 95th percentile and largest of some times."""
+    """Return median, 95th percentile and largest of timed runs as text."""
     p95, most = f"p95 {times.p95_ms:.1f} ms", f"largest {times.max_ms:.1f} ms"
     return f"{times.median_ms:.1f} ms median, {p95}, {most} of {times.repeats}"

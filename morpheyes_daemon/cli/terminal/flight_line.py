@@ -1,4 +1,4 @@
-"""The live line of a simulated flight, on standard error."""
+"""Progress line of a simulated flight, on standard error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class FlightLine:
-    """A bar of the way to the goal with state, speed and baseline; shows nothing when `quiet`."""
+    """A bar of the distance to the goal with state, speed and baseline; hidden when `quiet`."""
 
     def __init__(self, quiet: bool) -> None:
         self._progress = Progress(
@@ -37,7 +37,7 @@ class FlightLine:
         self._progress.stop()
 
     def show(self, at: FlightProgress) -> None:
-        """Show where the flight is."""
+        """Show the progress of the flight."""
         self._whole_m = max(self._whole_m, at.distance_m, 1e-3)
         figures = (
             f"{at.simulated_s:5.1f} s  {at.distance_m:5.1f} m to go  {at.speed_m_s:4.2f} m/s"
@@ -46,6 +46,6 @@ class FlightLine:
         done = max(0.0, 1.0 - at.distance_m / self._whole_m)
         self._progress.update(self._task, completed=done, state=at.phase, figures=figures)
 
-    def say(self, text: str) -> None:
-        """Show what is being done besides flying."""
+    def show_step(self, text: str) -> None:
+        """Show a step before or after the flight."""
         self._progress.update(self._task, figures=text)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.messages.core import Image, Mask
-from morpheyes_daemon.stereo.lucas_kanade import follow
+from morpheyes_daemon.stereo.lucas_kanade import LucasKanade
 from morpheyes_daemon.strategies.imo.rectified_frame import RectifiedFrame
 from morpheyes_daemon.transforms import Array
 
@@ -96,10 +96,8 @@ def track_features(before: Image, now: Image, uv: Array, guess: Array) -> tuple[
     if not len(uv):
         return np.empty((0, 2)), np.zeros(0, dtype=np.bool_)
     start = np.where(np.isfinite(guess), guess, uv)
-    return follow(
-        before, now, uv, start,
-        window_px=WINDOW_PX, levels=LEVELS, least_texture=MIN_TEXTURE, rounds=ITERATIONS, return_px=RETURN_PX,
-    )  # fmt: skip
+    tracker = LucasKanade(WINDOW_PX, LEVELS, min_eigenvalue=MIN_TEXTURE, iterations=ITERATIONS, return_px=RETURN_PX)
+    return tracker.track(before, now, uv, start)
 
 
 def stereo_disparity(frame: RectifiedFrame, uv: Array, d_guess: Array) -> tuple[Array, Mask]:

@@ -49,7 +49,7 @@ def test_there_is_no_board_in_a_blank_picture() -> None:
     assert find_corners(blank, CHARUCO) is None
 
 
-def test_the_right_eye_gets_the_left_eyes_order_whatever_the_detector_gave() -> None:
+def test_the_right_camera_gets_the_left_cameras_order_whatever_the_detector_gave() -> None:
     _, corners = CHESS.picture(20)
     shifted = corners - [31.0, 0.5]
     assert aligned(corners, shifted[::-1], CHESS) == pytest.approx(shifted)

@@ -31,8 +31,8 @@ def test_exact_corners_give_the_exact_rig() -> None:
     calibration = calibrate(seen)
     state = calibration.solution.state
     # the weak prior of the lens pulls by its share of the corner noise's floor, 1e-6 px
-    assert state.eyes[0][:4] == pytest.approx([CAM0.fx, CAM0.fy, CAM0.cx, CAM0.cy], abs=1e-3)
-    assert state.eyes[1][:4] == pytest.approx([CAM1.fx, CAM1.fy, CAM1.cx, CAM1.cy], abs=1e-3)
+    assert state.cameras[0][:4] == pytest.approx([CAM0.fx, CAM0.fy, CAM0.cx, CAM0.cy], abs=1e-3)
+    assert state.cameras[1][:4] == pytest.approx([CAM1.fx, CAM1.fy, CAM1.cx, CAM1.cy], abs=1e-3)
     for index, nominal in enumerate(THREE_M):
         assert calibration.poses[index] == pytest.approx(true_pose(nominal), abs=1e-6)
     assert np.nanmax(np.abs(calibration.solution.residual_px)) < 1e-3
@@ -80,7 +80,7 @@ def test_ten_sets_help_each_other() -> None:
     assert np.sqrt(np.mean(np.square(joint))) < 0.75 * np.sqrt(np.mean(np.square(separate)))
 
 
-def test_an_outlier_view_is_named_by_the_guilty_eye() -> None:
+def test_an_outlier_view_is_named_by_the_guilty_camera() -> None:
     seen = observations(THREE_M, noise_px=0.05, seed=3)
     rng = np.random.default_rng(0)
     seen.right[7] += rng.normal(0, 3.0, seen.right[7].shape)
@@ -101,7 +101,7 @@ def test_single_stray_corners_are_set_aside_and_their_pictures_kept() -> None:
     seen.left[4, 10] += [3.0, -2.0]
     seen.right[9, 30] += [1.5, 2.0]
     calibration = calibrate(seen)
-    assert calibration.strays == 2
+    assert calibration.stray_corners == 2
     assert not calibration.outliers
 
 

@@ -105,8 +105,8 @@ def test_a_number_used_twice_is_named(tmp_path: Path) -> None:
 
 def test_pictures_of_another_size_are_named_and_left_out(tmp_path: Path) -> None:
     write_pairs(tmp_path, 4)
-    for eye in ("left", "right"):
-        cv2.imwrite(str(tmp_path / f"{eye}05.png"), board_picture(size=(640, 480)))
+    for side in ("left", "right"):
+        cv2.imwrite(str(tmp_path / f"{side}05.png"), board_picture(size=(640, 480)))
     cv2.imwrite(str(tmp_path / "right04.png"), board_picture(size=(640, 480)))
     folders, problems = read_folder(tmp_path)
     seen = observe(folders, BOARD, problems=problems)

@@ -1,4 +1,4 @@
-"""How the left eye sits on the vehicle, from attitudes and boards: found, refused when it cannot be, kept in the file."""
+"""How the left camera sits on the vehicle, from attitudes and boards: found, refused when it cannot be, kept in the file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morpheyes_daemon.calibration.mount import ATTITUDES, MountViews, read_mount_folder, solve_mount, ways_up
+from morpheyes_daemon.calibration.mount import ATTITUDES, MountViews, orientations, read_mount_folder, solve_mount
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.config.mount_pose import T_frd_rig
 from morpheyes_daemon.config.vehicle import Mount
@@ -27,7 +27,7 @@ BOARD = Board(9, 6, 0.025)
 
 
 def turned(n: int, spread_rad: float, noise_rad: float, stray: int = 0) -> MountViews:
-    """Attitudes about a level one, and the board that an eye with the TRUE rotation sees, some of them upside down."""
+    """Attitudes about a level one, and the board that a camera with the TRUE rotation sees, some of them upside down."""
     rng = np.random.default_rng(5)
     R_ned_frd = np.array([R_from_rotvec(rng.normal(0.0, spread_rad, 3)) for _ in range(n)])
     wall = R_FRD_RIG @ R_from_rotvec(np.array([0.1, 0.2, 0.0]))
@@ -49,7 +49,9 @@ def test_without_errors_the_rotation_is_found_exactly() -> None:
     found = solve_mount(turned(12, 0.5, 0.0), R_FRD_RIG, 2)
     assert off_rad(found.mount) < 1e-9
     assert found.rms_rad < 1e-9
-    assert math.degrees(found.turned_rad) == pytest.approx(50.0, abs=10.0)  # half a radian about each of three axes
+    assert math.degrees(found.rotation_spread_rad) == pytest.approx(
+        50.0, abs=10.0
+    )  # half a radian about each of three axes
 
 
 def test_what_is_left_of_an_attitudes_error_is_what_it_says() -> None:
@@ -67,7 +69,7 @@ def test_a_few_attitudes_that_are_quite_wrong_hardly_count() -> None:
 
 
 def test_a_vehicle_that_was_hardly_turned_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="turn the vehicle farther"):
+    with pytest.raises(CalibrationError, match="rotate the vehicle farther"):
         solve_mount(turned(30, 0.03, 3.5e-3), R_FRD_RIG, 2)
 
 
@@ -77,7 +79,7 @@ def test_a_vehicle_that_was_turned_about_one_axis_or_none_is_refused(axes: tuple
     attitudes = [R_from_rotvec(np.array(axes) * 0.1 * k) for k in range(12)]
     wall = R_FRD_RIG
     seen = [(attitude @ R_FRD_RIG @ R_from_rotvec(TRUE)).T @ wall for attitude in attitudes]
-    with pytest.raises(CalibrationError, match="turn the vehicle farther"):
+    with pytest.raises(CalibrationError, match="rotate the vehicle farther"):
         solve_mount(replace(views, R_ned_frd=np.array(attitudes), R_cam0_board=np.array(seen)), R_FRD_RIG, 2)
 
 
@@ -88,9 +90,9 @@ def test_too_few_pictures_are_refused() -> None:
 
 def test_boards_look_the_same_in_one_two_or_four_ways_up() -> None:
     assert [
-        ways_up(Board(9, 6, 0.025)),
-        ways_up(Board(6, 6, 0.025)),
-        ways_up(Board(9, 6, 0.025, "charuco", "5X5_1000", 0.7)),
+        orientations(Board(9, 6, 0.025)),
+        orientations(Board(6, 6, 0.025)),
+        orientations(Board(9, 6, 0.025, "charuco", "5X5_1000", 0.7)),
     ] == [2, 4, 1]
 
 
@@ -101,13 +103,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_the_twins_eye_is_found_from_its_pictures(folder: Path) -> None:
+def test_the_twins_camera_is_found_from_its_pictures(folder: Path) -> None:
     twin = RigTwin(640, 480, seed=1)
     views = read_mount_folder(folder, BOARD, twin.cam0)
     assert len(views.names) >= 20
-    found = solve_mount(views, R_FRD_RIG, ways_up(BOARD))
+    found = solve_mount(views, R_FRD_RIG, orientations(BOARD))
     true = rotvec_from_R(twin.T_rig_eye(0, twin.actual_m(RANGE_M[0]))[:3, :3])
-    # the eye is 9 mrad off; 3.5 mrad of attitude error in each of two dozen pictures leave about one of each axis
+    # the camera is 9 mrad off; 3.5 mrad of attitude error in each of two dozen pictures leave about one of each axis
     assert np.linalg.norm(true) > 8e-3
     assert off_rad(found.mount, true) < 4e-3
 
@@ -129,9 +131,9 @@ def test_pictures_that_cannot_be_used_are_named_and_left_out(folder: Path, tmp_p
     ("text", "said"),
     [
         ("picture,roll_deg,pitch_deg\n", "needs the columns picture, roll_deg, pitch_deg, yaw_deg"),
-        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1,2,x\n", "line 2: the angles are no numbers"),
-        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1,2,nan\n", "line 2: the angles are no numbers"),
-        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1\n", "line 2: the angles are no numbers"),
+        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1,2,x\n", "line 2: the angles are not numbers"),
+        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1,2,nan\n", "line 2: the angles are not numbers"),
+        ("picture,roll_deg,pitch_deg,yaw_deg\nleft01.png,1\n", "line 2: the angles are not numbers"),
     ],
 )
 def test_a_bad_list_of_attitudes_is_refused_naming_the_line(tmp_path: Path, text: str, said: str) -> None:
@@ -145,7 +147,7 @@ def test_a_folder_without_attitudes_says_how_to_take_them(tmp_path: Path) -> Non
         read_mount_folder(tmp_path, BOARD, RigTwin(640, 480, seed=1).cam0)
 
 
-def test_the_file_keeps_it_and_the_rectified_eye_points_there(tmp_path: Path) -> None:
+def test_the_file_keeps_it_and_the_rectified_camera_points_there(tmp_path: Path) -> None:
     rig = RigTwin(640, 480, seed=1).exact_rig(3)
     mounted = replace(rig, mount=CameraMount((0.009, -0.006, 0.004), (1e-3, 1e-3, 1e-3)))
     write_calibration(mounted, tmp_path / "rig.yaml")

@@ -65,7 +65,7 @@ def test_an_inner_baseline_is_predicted_by_the_others() -> None:
 
 def test_held_out_rows_are_corner_noise_and_little_else() -> None:
     unseen = held_out(calibrate(observations(TEN_M, noise_px=0.1, seed=6)))
-    # two eyes with 0.1 px each: median of |N(0, 0.141)| is 0.095, 95 % is 0.277; poses add some percent
+    # two cameras with 0.1 px each: median of |N(0, 0.141)| is 0.095, 95 % is 0.277; poses add some percent
     assert unseen.median_px == pytest.approx(0.095, rel=0.12)
     assert unseen.p95_px == pytest.approx(0.277, rel=0.12)
 

@@ -156,14 +156,14 @@ def test_the_same_seed_renders_the_same_pictures(boards: Path, tmp_path: Path) -
     assert np.array_equal(one, two)
 
 
-def test_the_eyes_mount_is_measured_and_written_into_the_file(tmp_path: Path, terminal: Terminal) -> None:
+def test_the_cameras_mount_is_measured_and_written_into_the_file(tmp_path: Path, terminal: Terminal) -> None:
     file, held = tmp_path / "rig.yaml", tmp_path / "held"
     write_calibration(RigTwin(640, 480, seed=0).exact_rig(3), file)
     assert terminal("render", held, "--mount", "--views", 20)[0] == 0
     code, out, _ = terminal("mount", file, held, "--out", tmp_path / "mounted.yaml", "--json")
     found = json.loads(out)
     assert code == 0
-    # the twin's left eye is turned by -0.52, 0.32 and 0.08 degrees
+    # the twin's left camera is turned by -0.52, 0.32 and 0.08 degrees
     assert found["rotation_deg"] == pytest.approx([-0.52, 0.32, 0.08], abs=0.25)
     assert max(found["sigma_deg"]) < 0.15
     assert read_calibration(tmp_path / "mounted.yaml").mount is not None
@@ -175,7 +175,7 @@ def test_the_eyes_mount_is_measured_and_written_into_the_file(tmp_path: Path, te
     assert before == pytest.approx(0.61, abs=0.02)
     assert after < 0.25
     code, out, _ = terminal("mount", file, held)
-    assert "the left eye is turned up by -0." in out
+    assert "the left camera is rotated up by -0." in out
     assert read_calibration(file).mount is not None
 
 

@@ -19,7 +19,7 @@ from morpheyes_daemon.config.vehicle import (
 )  # fmt: skip
 from morpheyes_daemon.errors import ConfigError
 from morpheyes_daemon.messages.core import Pinhole, VehicleState
-from morpheyes_daemon.perception.camera_motion import CameraMotion, camera_motion, right_eye_rates, row_rates
+from morpheyes_daemon.perception.camera_motion import CameraMotion, camera_motion, right_camera_rates, row_rates
 from morpheyes_daemon.perception.craft import build_craft, build_strategy
 from morpheyes_daemon.strategies.forest.strategy import Forest
 from morpheyes_daemon.transforms import R_FRD_CAM, R_from_rotvec, R_from_rpy, pose, rpy_from_R
@@ -66,7 +66,7 @@ def test_on_the_ground_nothing_moves() -> None:
     still = CameraMotion.still(np.eye(4))
     assert not still.v_rect_m_s.any()
     assert not still.w_rect_rad_s.any()
-    assert not right_eye_rates(np.array([[10.0, 20.0]]), np.array([5.0]), PINHOLE, BASELINE_M, still).any()
+    assert not right_camera_rates(np.array([[10.0, 20.0]]), np.array([5.0]), PINHOLE, BASELINE_M, still).any()
 
 
 def seen_by_the_right(point_ned: np.ndarray, T_ned_rect: np.ndarray) -> np.ndarray:
@@ -90,7 +90,7 @@ D_PX = np.array([30.0, 12.0, 8.0, 4.0, 20.0])
 
 
 def test_points_move_in_the_right_image_as_the_moved_vehicle_sees_them() -> None:
-    assert right_eye_rates(UV, D_PX, PINHOLE, BASELINE_M, motion()) == pytest.approx(
+    assert right_camera_rates(UV, D_PX, PINHOLE, BASELINE_M, motion()) == pytest.approx(
         numeric_rates(UV, D_PX, MOVING), rel=1e-3, abs=0.05
     )
 
@@ -100,13 +100,15 @@ def test_row_rates_are_split_into_travel_and_turning() -> None:
     assert by_travel + by_turning == pytest.approx(numeric_rates(UV, D_PX, MOVING)[:, 1], rel=1e-3, abs=0.05)
     # the travel of the left camera alone: it has the lever's part of the turning in it
     v, w = motion().v_rect_m_s, np.zeros(3)
-    alone = right_eye_rates(UV, D_PX, PINHOLE, BASELINE_M, CameraMotion(np.eye(4), v, w))
+    alone = right_camera_rates(UV, D_PX, PINHOLE, BASELINE_M, CameraMotion(np.eye(4), v, w))
     assert by_travel == pytest.approx(alone[:, 1])
     assert np.abs(by_turning).min() > 1.0
 
 
 def test_a_point_without_disparity_is_far_and_moves_by_turning_alone() -> None:
-    far = right_eye_rates(UV, np.full(5, -3.0), PINHOLE, BASELINE_M, motion(replace(MOVING, rates_frd_rad_s=(0, 0, 0))))
+    far = right_camera_rates(
+        UV, np.full(5, -3.0), PINHOLE, BASELINE_M, motion(replace(MOVING, rates_frd_rad_s=(0, 0, 0)))
+    )
     assert np.abs(far).max() < 1e-9
 
 

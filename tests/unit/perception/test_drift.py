@@ -10,8 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px
 from morpheyes_daemon.messages.core import BaselineEstimate, Pinhole, StereoFrame
-from morpheyes_daemon.perception.camera_motion import CameraMotion, right_eye_rates, row_rates
-from morpheyes_daemon.perception.extrinsics_monitor import ExtrinsicsFault, ExtrinsicsMonitor, rows_apart_rad, turned_rig
+from morpheyes_daemon.perception.camera_motion import CameraMotion, right_camera_rates, row_rates
+from morpheyes_daemon.perception.extrinsics_monitor import (
+    ExtrinsicsFault,
+    ExtrinsicsMonitor,
+    row_mismatch_rad,
+    turned_rig,
+)
 from morpheyes_daemon.perception.yaw_estimator import leverage
 from morpheyes_daemon.stereo.calibration_file import calibration_hash
 from morpheyes_daemon.stereo.depth import DepthEstimator, disparity_of
@@ -36,7 +41,7 @@ def test_a_rig_turned_by_a_yaw_shows_that_much_disparity_at_infinity() -> None:
 
 
 def test_rows_are_no_farther_apart_than_a_wrong_baseline_can_make_them() -> None:
-    """Directions of things three metres off, as the right eye sees them and as it should for the baseline believed."""
+    """Directions of things three metres off, as the right camera sees them and as it should for the baseline believed."""
     rig = RigModel.from_poses(CAM0, CAM1, TEN_M.tolist(), [true_pose(b) for b in TEN_M])
     x, y = np.meshgrid([-0.4, 0.0, 0.4], [-0.3, 0.0, 0.3])
     points = 3.0 * np.stack([x.ravel(), y.ravel(), np.ones(9)], axis=1)
@@ -47,9 +52,9 @@ def test_rows_are_no_farther_apart_than_a_wrong_baseline_can_make_them() -> None
         rays = [(points @ T[:3, :3].T + T[:3, 3]) @ R_rect_cam1.T for T in (seen, expected)]
         rows = [ray[:, 1] / ray[:, 2] for ray in rays]
         apart = float(np.median(np.abs(rows[0] - rows[1])))
-        bound = rows_apart_rad(rig, nominal_m, true_m)
+        bound = row_mismatch_rad(rig, nominal_m, true_m)
         assert apart <= bound <= 5.0 * apart + 2e-4
-    assert rows_apart_rad(rig, 0.2, 0.2) == pytest.approx(0.0, abs=1e-9)
+    assert row_mismatch_rad(rig, 0.2, 0.2) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_turning_back_gives_the_rig_again() -> None:
@@ -59,7 +64,7 @@ def test_turning_back_gives_the_rig_again() -> None:
     assert again.T_cam0_cam1(0.17) == pytest.approx(rig.T_cam0_cam1(0.17), abs=1e-9)
 
 
-def test_rates_of_the_right_eye_are_those_of_moving_the_rig() -> None:
+def test_rates_of_the_right_camera_are_those_of_moving_the_rig() -> None:
     pinhole, b = Pinhole(640, 480, 740.0, 319.5, 239.5), 0.25
     v, w, dt = np.array([0.4, -0.3, 2.0]), np.array([0.2, -0.3, 0.4]), 1e-6
     motion = CameraMotion(np.eye(4), v, w)
@@ -69,7 +74,7 @@ def test_rates_of_the_right_eye_are_those_of_moving_the_rig() -> None:
     T_before_after = pose(R_from_rotvec(w * dt), v * dt)
     moved = points @ inverse(T_before_after)[:3, :3].T + inverse(T_before_after)[:3, 3]
     right = [(p - [b, 0, 0])[:, :2] / p[:, 2:] * pinhole.f_px + middle for p in (points, moved)]
-    rates = right_eye_rates(uv, b * pinhole.f_px / points[:, 2], pinhole, b, motion)
+    rates = right_camera_rates(uv, b * pinhole.f_px / points[:, 2], pinhole, b, motion)
     assert rates == pytest.approx((right[1] - right[0]) / dt, rel=1e-3, abs=1e-2), "first order over a microsecond"
 
 
@@ -85,7 +90,7 @@ SMALL = crooked_rig(320, 240)
 def watched(
     pitch_deg: float, panels: list[Panel], frames: int, moving: bool = False
 ) -> tuple[ExtrinsicsMonitor, list[ExtrinsicsFault]]:
-    """A monitor that has seen the same still pair for so many frames, the right eye having turned since."""
+    """A monitor that has seen the same still pair for so many frames, the right camera having turned since."""
     monitor = ExtrinsicsMonitor(turned_rig(SMALL, -np.radians([pitch_deg, 0.0, 0.0]), 0.2))
     estimator = DepthEstimator(monitor.rig)
     at = BaselineEstimate(0, 0.2, 0.2, 1e-4, moving)
@@ -100,7 +105,9 @@ def watched(
 
 @pytest.mark.parametrize(("late_ms", "frames", "late"), [(2.0, 9, False), (5.0, 9, False), (7.0, 2, False),
                                                           (7.0, 3, True), (20.0, 3, True)])  # fmt: skip
-def test_eyes_that_expose_far_from_when_they_should_end_trust_in_depth(late_ms: float, frames: int, late: bool) -> None:
+def test_cameras_that_expose_far_from_when_they_should_end_trust_in_depth(
+    late_ms: float, frames: int, late: bool
+) -> None:
     """Declared are 2 ms; the rows are moved as flying ahead at 3 m/s moves them in that time."""
     monitor = ExtrinsicsMonitor(SMALL)
     estimator = DepthEstimator(SMALL)
@@ -113,10 +120,10 @@ def test_eyes_that_expose_far_from_when_they_should_end_trust_in_depth(late_ms: 
     offsets = replace(offsets, dv_px=offsets.dv_px + late_ms / 1e3 * by_travel)
     for _ in range(frames):
         monitor.update(pair, depth, offsets, False, ahead)
-    assert monitor.late is late
+    assert monitor.out_of_sync is late
 
 
-def test_a_pitched_eye_is_told_at_once_and_corrected_ten_frames_later() -> None:
+def test_a_pitched_camera_is_told_at_once_and_corrected_ten_frames_later() -> None:
     monitor, told = watched(0.15, WORLD, frames=11)
     assert told == [ExtrinsicsFault.ROWS, ExtrinsicsFault.TURNED]
     turned_back = inverse(SMALL.T_cam0_cam1(0.2)) @ monitor.rig.T_cam0_cam1(0.2)
@@ -140,7 +147,7 @@ def test_nothing_is_corrected_while_the_servo_moves() -> None:
     assert ExtrinsicsFault.TURNED not in told
 
 
-def test_an_eye_that_turned_far_is_broken_and_not_mended() -> None:
+def test_a_camera_that_turned_far_is_broken_and_not_mended() -> None:
     monitor, told = watched(0.3, WORLD, frames=15)
     assert told == [ExtrinsicsFault.ROWS, ExtrinsicsFault.BROKEN]
     assert monitor.broken
@@ -152,6 +159,6 @@ def test_a_yaw_too_large_for_a_drift_must_be_seen_by_two_pairs_of_frames() -> No
     found = {}
     for pairs in (1, 2):
         monitor._yaw = SimpleNamespace(yaw_rad=yaw_rad, sigma_rad=0.02 * yaw_rad, pairs=pairs)  # type: ignore[assignment]
-        found[pairs] = [finding.what for finding in monitor._judge_yaw(740.0, 0.2)], monitor.broken
-    assert found == {1: ([ExtrinsicsFault.DOUBTED], False), 2: ([ExtrinsicsFault.BROKEN], True)}
+        found[pairs] = [finding.what for finding in monitor._check_yaw(740.0, 0.2)], monitor.broken
+    assert found == {1: ([ExtrinsicsFault.UNCONFIRMED], False), 2: ([ExtrinsicsFault.BROKEN], True)}
     assert calibration_hash(monitor.rig) == calibration_hash(rig), "and nothing was corrected"

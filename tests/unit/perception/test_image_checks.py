@@ -39,7 +39,7 @@ def test_a_good_pair_has_no_fault(pair):
     assert matching_faults(*pair, 0.0) == set()
 
 
-def test_the_same_image_again_is_frozen_in_either_eye(pair):
+def test_the_same_image_again_is_frozen_in_either_camera(pair):
     left, right = pair
     noisy = left ^ np.uint8(1)
     check = FrozenCheck()
@@ -60,7 +60,7 @@ def test_one_changed_pixel_is_not_frozen(pair):
     assert not check.check(other_left, other_right)
 
 
-@pytest.mark.parametrize("eye", [0, 1])
+@pytest.mark.parametrize("side", [0, 1])
 @pytest.mark.parametrize(
     ("spoil", "fault"),
     [
@@ -70,9 +70,9 @@ def test_one_changed_pixel_is_not_frozen(pair):
         (lambda image: np.full_like(image, 120), ImageFault.BLANK),
     ],
 )
-def test_an_eye_that_sees_nothing_is_told(pair, eye, spoil, fault):
+def test_a_camera_that_sees_nothing_is_told(pair, side, spoil, fault):
     images = list(pair)
-    images[eye] = spoil(images[eye]).astype(np.uint8)
+    images[side] = spoil(images[side]).astype(np.uint8)
     assert exposure_faults(*images) == {fault}
 
 
@@ -83,7 +83,7 @@ def test_dusk_and_bright_sky_are_no_faults(pair):
     assert exposure_faults(*sky) == set()
 
 
-def test_swapped_eyes_are_told(pair):
+def test_swapped_cameras_are_told(pair):
     left, right = pair
     assert matching_faults(right, left, valid_fraction(right, left)) == {ImageFault.SWAPPED}
 
@@ -113,7 +113,7 @@ def test_every_fault_says_what_it_is():
 
 
 F_PX = 372.0
-"""Of the simulator's eyes at 320 pixels: two rows are 5.4 mrad."""
+"""Of the simulator's cameras at 320 pixels: two rows are 5.4 mrad."""
 
 
 def disparity(left, right):
@@ -124,17 +124,17 @@ def ask(check, left, right, disparity_px):
     return check.check(left, row_offsets(left, right, disparity_px), F_PX)
 
 
-def test_eyes_that_see_the_same_are_alike(pair):
+def test_cameras_that_see_the_same_are_alike(pair):
     check = PairCheck()
     assert [ask(check, *pair, disparity(*pair)) for _ in range(6)] == [set()] * 6
 
 
-def test_eyes_that_see_different_things_are_told_after_three_frames(pair):
+def test_cameras_that_see_different_things_are_told_after_three_frames(pair):
     left, right = pair
     wrong = disparity(left, right) + 12
     check = PairCheck()
-    assert [ask(check, left, right, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.UNLIKE}] * 2
-    assert ask(check, left, right, disparity(left, right)) == {ImageFault.UNLIKE}
+    assert [ask(check, left, right, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.SCENE_MISMATCH}] * 2
+    assert ask(check, left, right, disparity(left, right)) == {ImageFault.SCENE_MISMATCH}
     assert ask(check, left, right, disparity(left, right)) == set(), "two good frames clear it"
 
 
@@ -150,50 +150,50 @@ def test_rows_that_stay_apart_are_told_after_five_frames(pair):
     apart, wrong, good = np.roll(right, 2, axis=0), disparity(left, right), (left, right, disparity(left, right))
     check = PairCheck()
     found = [ask(check, left, apart, wrong) for _ in range(6)]
-    assert found == [set()] * 4 + [{ImageFault.APART}] * 2
-    assert [ask(check, *good) for _ in range(4)] == [{ImageFault.APART}] * 3 + [set()], "four bad frames of eight"
+    assert found == [set()] * 4 + [{ImageFault.ROW_MISMATCH}] * 2
+    assert [ask(check, *good) for _ in range(4)] == [{ImageFault.ROW_MISMATCH}] * 3 + [set()], "four bad frames of eight"
 
 
 def test_few_places_of_which_none_is_found_again_are_told(pair):
-    """Swapped eyes in a dense view: hardly a place has a depth at all."""
+    """Swapped cameras in a dense view: hardly a place has a depth at all."""
     nothing = RowOffsets(np.empty((0, 2)), np.empty(0), np.empty(0), tried=45)
     check = PairCheck()
-    assert [check.check(pair[0], nothing, F_PX) for _ in range(3)] == [set(), set(), {ImageFault.UNLIKE}]
+    assert [check.check(pair[0], nothing, F_PX) for _ in range(3)] == [set(), set(), {ImageFault.SCENE_MISMATCH}]
     check, fewer = PairCheck(), replace(nothing, tried=20)
     assert [check.check(pair[0], fewer, F_PX) for _ in range(4)] == [set()] * 4, "too few to say"
 
 
 @pytest.mark.parametrize(("rows_px", "told"), [(0.0005 * F_PX, False), (0.002 * F_PX, True)])
-def test_few_places_that_are_found_again_vouch_for_the_eyes_when_their_rows_agree(pair, rows_px, told):
+def test_few_places_that_are_found_again_vouch_for_the_cameras_when_their_rows_agree(pair, rows_px, told):
     """All that is seen is far and hazy, or the few partners are false."""
     few = RowOffsets(np.zeros((20, 2)), np.full(20, 3.0), np.full(20, rows_px), tried=90)
     check = PairCheck()
     assert [bool(check.check(pair[0], few, F_PX)) for _ in range(4)] == [False, False, told, told]
 
 
-def test_rows_far_apart_are_told_after_three_frames_like_eyes_that_see_different_things(pair):
-    """Swapped eyes find false partners far off their rows."""
+def test_rows_far_apart_are_told_after_three_frames_like_cameras_that_see_different_things(pair):
+    """Swapped cameras find false partners far off their rows."""
     left, right = pair
     apart, wrong = np.roll(right, 5, axis=0), disparity(left, right)
     assert row_offsets(left, apart, wrong).count > 0.3 * row_offsets(left, apart, wrong).tried
     check = PairCheck()
-    assert [ask(check, left, apart, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.UNLIKE}] * 2
+    assert [ask(check, left, apart, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.SCENE_MISMATCH}] * 2
 
 
-def test_rows_no_farther_apart_than_the_doubt_in_where_the_eyes_point_are_no_fault(pair):
+def test_rows_no_farther_apart_than_the_doubt_in_where_the_cameras_point_are_no_fault(pair):
     left, right = pair
     apart = np.roll(right, 2, axis=0)
     offsets = row_offsets(left, apart, disparity(left, apart))
-    kept = {doubt_rad: PairCheck() for doubt_rad in (0.0, 1e-3, 4e-3)}
+    kept = {row_uncertainty_rad: PairCheck() for row_uncertainty_rad in (0.0, 1e-3, 4e-3)}
     found = {
-        doubt_rad: [check.check(left, offsets, F_PX, doubt_rad) for _ in range(6)][-1]
-        for doubt_rad, check in kept.items()
+        row_uncertainty_rad: [check.check(left, offsets, F_PX, row_uncertainty_rad) for _ in range(6)][-1]
+        for row_uncertainty_rad, check in kept.items()
     }
-    assert found == {0.0: {ImageFault.APART}, 1e-3: {ImageFault.APART}, 4e-3: set()}
+    assert found == {0.0: {ImageFault.ROW_MISMATCH}, 1e-3: {ImageFault.ROW_MISMATCH}, 4e-3: set()}
 
 
 def test_rows_apart_for_a_moment_are_no_fault(pair):
-    """As in a quick pitch, where 2 ms between the eyes show."""
+    """As in a quick pitch, where 2 ms between the cameras show."""
     left, right = pair
     apart, depth = np.roll(right, 2, axis=0), disparity(left, right)
     check = PairCheck()

@@ -19,8 +19,8 @@ def test_depth_of_a_rig_that_is_broken_or_late_is_worth_nothing(
     plan = make_plan("forest", size="320x240", calibration="exact")
     rig = crooked_rig(320, 240)
     pipeline = Pipeline(plan.config, plan.mission, rig)
-    pipeline._drift.broken = broken
-    monkeypatch.setattr(ExtrinsicsMonitor, "late", late)
+    pipeline._extrinsics.broken = broken
+    monkeypatch.setattr(ExtrinsicsMonitor, "out_of_sync", late)
     panels = [Panel(5.0, slope_x=0.3), Panel(2.5, x_m=(-0.3, 0.6), y_m=(-0.5, 0.3), seed=3)]
     frame = StereoFrame(0, 0, *raw_pair(panels, rig, 0.2, noise=1.5), BaselineEstimate(0, 0.2, 0.2, 1e-4, False))
     seen = pipeline.perceive(VisionJob(frame, VehicleState(), keep_images=False))

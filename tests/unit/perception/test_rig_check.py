@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from morpheyes_daemon.errors import CalibrationError, InputError
-from morpheyes_daemon.perception.calibration_check import CheckResult, RigCheck
+from morpheyes_daemon.perception.calibration_check import CalibrationCheck, CalibrationCheckResult
 from morpheyes_daemon.perception.extrinsics_monitor import turned_rig
 from tests.support.panels import Panel, crooked_rig, raw_pair
 
@@ -15,10 +15,10 @@ RIG = crooked_rig(320, 240)
 F_PX = 370.0
 
 
-def checked(pitch_deg: float, yaw_deg: float, panels_at: dict[float, list[Panel]]) -> CheckResult:
-    """What the check says when the right eye has turned since the calibration, by so much."""
+def checked(pitch_deg: float, yaw_deg: float, panels_at: dict[float, list[Panel]]) -> CalibrationCheckResult:
+    """What the check says when the right camera has turned since the calibration, by so much."""
     believed = turned_rig(RIG, -np.radians([pitch_deg, yaw_deg, 0.0]), 0.2)
-    check = RigCheck(believed, (320, 240))
+    check = CalibrationCheck(believed, (320, 240))
     for baseline_m, panels in panels_at.items():
         check.add(baseline_m, *raw_pair(panels, RIG, baseline_m, noise=1.5))
     return check.result()
@@ -26,7 +26,7 @@ def checked(pitch_deg: float, yaw_deg: float, panels_at: dict[float, list[Panel]
 
 def test_a_good_calibration_is_fit_to_fly() -> None:
     result = checked(0.0, 0.0, {0.1: PANELS, 0.3: PANELS})
-    assert result.verdict.startswith("fit to fly")
+    assert result.acceptance.startswith("fit to fly")
     assert result.passed
     assert result.findings == ()
     # the yaw's own sigma is about a tenth of a pixel
@@ -35,7 +35,7 @@ def test_a_good_calibration_is_fit_to_fly() -> None:
 
 def test_a_bent_rig_is_told_with_its_pitch_and_its_yaw() -> None:
     result = checked(0.15, 0.15, {0.1: PANELS, 0.3: PANELS})
-    assert not result.verdict.startswith("fit to fly")
+    assert not result.acceptance.startswith("fit to fly")
     for one in result.baselines:
         assert one.fit is not None
         assert math.degrees(one.fit.pitch_rad) == pytest.approx(0.15, abs=0.02)
@@ -53,11 +53,11 @@ def test_a_scene_that_moves_tells_nothing_of_the_yaw() -> None:
 def test_a_bare_wall_is_said_to_tell_nothing() -> None:
     result = checked(0.15, 0.15, {0.1: [Panel(3.0, contrast=0.01)], 0.3: [Panel(3.0, contrast=0.01)]})
     assert all(one.figures()["epipolar_median_px"] is None for one in result.baselines)
-    assert "look at something else" in result.findings[0]
+    assert "point the cameras at another scene" in result.findings[0]
 
 
 def test_no_pictures_and_baselines_outside_are_errors() -> None:
-    check = RigCheck(RIG, (320, 240))
+    check = CalibrationCheck(RIG, (320, 240))
     with pytest.raises(InputError, match="no pictures"):
         check.result()
     with pytest.raises(CalibrationError, match="covers"):

@@ -10,7 +10,7 @@ import pytest
 
 from morpheyes_daemon.messages.core import DepthMap, Pinhole
 from morpheyes_daemon.perception.camera_motion import CameraMotion
-from morpheyes_daemon.perception.depth_scale_monitor import DepthScaleMonitor, Sight, scale_between
+from morpheyes_daemon.perception.depth_scale_monitor import DepthScaleMonitor, ScaleObservation, scale_between
 from morpheyes_daemon.transforms import R_from_rotvec, pose
 
 PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)
@@ -28,8 +28,10 @@ def texture() -> np.ndarray:
 TEXTURE = texture()
 
 
-def sight(t_s: float, way_m: np.ndarray, turn_rad: np.ndarray, told_turn_rad: np.ndarray, v: np.ndarray) -> Sight:
-    """The wall from an eye that has gone `way_m` and turned; the autopilot tells `told_turn_rad` and `v`."""
+def sight(
+    t_s: float, way_m: np.ndarray, turn_rad: np.ndarray, told_turn_rad: np.ndarray, v: np.ndarray
+) -> ScaleObservation:
+    """The wall from a camera that has gone `way_m` and turned; the autopilot tells `told_turn_rad` and `v`."""
     v_pixel, u_pixel = np.mgrid[0:240, 0:320]
     x, y = (u_pixel - PINHOLE.cx_px) / PINHOLE.f_px, (v_pixel - PINHOLE.cy_px) / PINHOLE.f_px
     R = R_from_rotvec(turn_rad)
@@ -38,9 +40,11 @@ def sight(t_s: float, way_m: np.ndarray, turn_rad: np.ndarray, told_turn_rad: np
     places = way_m + rays * along[..., None]
     maps = ((places[..., i] * 100.0 + centre).astype(np.float32) for i, centre in ((0, 400.0), (1, 300.0)))
     image = cv2.remap(TEXTURE, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-    depth = along.astype(np.float32)  # along the optical axis, since a ray's third part is 1 in the eye's own axes
+    depth = along.astype(np.float32)  # along the optical axis, since a ray's third part is 1 in the camera's own axes
     told = R_from_rotvec(told_turn_rad)
-    return Sight(image.astype(np.uint8), depth_map(t_s, depth), CameraMotion(pose(told, way_m), told.T @ v, np.zeros(3)))
+    return ScaleObservation(
+        image.astype(np.uint8), depth_map(t_s, depth), CameraMotion(pose(told, way_m), told.T @ v, np.zeros(3))
+    )
 
 
 def depth_map(t_s: float, depth_m: np.ndarray) -> DepthMap:
@@ -52,11 +56,11 @@ def depth_map(t_s: float, depth_m: np.ndarray) -> DepthMap:
     )  # fmt: skip
 
 
-def stretched(one: Sight, factor: float) -> Sight:
+def stretched(one: ScaleObservation, factor: float) -> ScaleObservation:
     return replace(one, depth=replace(one.depth, depth_m=one.depth.depth_m * np.float32(factor)))
 
 
-def flight(v: tuple[float, float, float], count: int = 8, gyro_error_rad: float = 0.0) -> list[Sight]:
+def flight(v: tuple[float, float, float], count: int = 8, gyro_error_rad: float = 0.0) -> list[ScaleObservation]:
     speed, rng = np.array(v), np.random.default_rng(2)
     turns = [np.array([0.02, -0.015, 0.01]) * n for n in range(count)]
     told = [turn + gyro_error_rad * rng.standard_normal(3) for turn in turns]
@@ -68,7 +72,7 @@ FORWARD = flight((0.0, 0.0, 2.0))
 
 @pytest.mark.parametrize("factor", [0.4, 0.8, 1.0, 1.5, 3.0])
 @pytest.mark.parametrize("seen", [FORWARD, flight((0.8, 0.2, 1.5)), flight((0.0, 0.0, 2.0), 4, 0.005)])
-def test_the_factor_is_found(factor: float, seen: list[Sight]) -> None:
+def test_the_factor_is_found(factor: float, seen: list[ScaleObservation]) -> None:
     fit = scale_between(stretched(seen[1], factor), stretched(seen[2], factor))
     assert fit is not None
     # a tenth of a pixel of 6 that a point moves

@@ -14,7 +14,8 @@ from morpheyes_daemon.calibration.mount import ATTITUDES, attitude_rows
 from morpheyes_daemon.calibration.targets.boards import Board
 from morpheyes_daemon.clock import S
 from morpheyes_daemon.messages.core import RawPair, VehicleState
-from morpheyes_daemon.rig_capture.mount_capture import capture_mount
+from morpheyes_daemon.rig_capture.board_capture import BoardFolder
+from morpheyes_daemon.rig_capture.mount_capture import AttitudeSource, capture_mount
 from morpheyes_daemon.simulation.camera.calibration_boards import BoardTwin
 from morpheyes_daemon.simulation.camera.true_rig import RigTwin
 from morpheyes_daemon.transforms import Array, R_from_rpy, rpy_from_R
@@ -61,9 +62,9 @@ class Hands:
 
 def take(hands: Hands, out: Path, wanted: int) -> tuple[int, set[str]]:
     said: set[str] = set()
-    stand, clock = cast(Any, hands), cast(Any, hands)
-    say = lambda kept, text: said.add(text)  # noqa: E731
-    return asyncio.run(capture_mount(stand, hands.vehicle, clock, out, BOARD, wanted, say)), said
+    source = AttitudeSource(hands.vehicle, cast(Any, hands))
+    show = lambda kept, text: said.add(text)  # noqa: E731
+    return asyncio.run(capture_mount(cast(Any, hands), source, BoardFolder(out, BOARD), wanted, show)), said
 
 
 def test_each_attitude_is_kept_once_with_its_picture(held: Held, tmp_path: Path) -> None:
@@ -71,8 +72,8 @@ def test_each_attitude_is_kept_once_with_its_picture(held: Held, tmp_path: Path)
     kept, said = take(hands, tmp_path, 3)
     assert kept == 3
     assert hands.placed == [0.1]
-    assert {"kept", "hold the vehicle still", "no whole board in the left picture"} <= said
-    assert any(text.startswith("turn it otherwise") for text in said)
+    assert {"kept", "hold the vehicle still", "no complete board in the left picture"} <= said
+    assert any(text.startswith("rotate the vehicle differently") for text in said)
     rows = list(attitude_rows(tmp_path / ATTITUDES))
     assert [name for name, _ in rows] == ["left01.png", "left02.png", "left03.png"]
     for (name, R), (_, true) in zip(rows, held, strict=False):
@@ -92,7 +93,7 @@ def test_it_goes_on_where_it_stopped(held: Held, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("state", "said"),
     [
-        ({"attitude_t_ns": 1}, "the autopilot is not heard"),
+        ({"attitude_t_ns": 1}, "no recent attitude from the autopilot"),
         ({"rates_frd_rad_s": (0.0, 0.2, 0.0)}, "hold the vehicle still"),
     ],
 )
@@ -101,11 +102,8 @@ def test_an_old_attitude_or_a_turning_vehicle_is_not_kept(
 ) -> None:
     hands = Hands(held, **state)
     heard: set[str] = set()
+    source, out = AttitudeSource(hands.vehicle, cast(Any, hands)), BoardFolder(tmp_path, BOARD)
     with pytest.raises(TimeoutError):
-        asyncio.run(
-            capture_mount(
-                cast(Any, hands), hands.vehicle, cast(Any, hands), tmp_path, BOARD, 1, lambda kept, text: heard.add(text)
-            )
-        )
+        asyncio.run(capture_mount(cast(Any, hands), source, out, 1, lambda kept, text: heard.add(text)))
     assert said in heard
     assert "kept" not in heard

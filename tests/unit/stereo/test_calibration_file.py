@@ -104,7 +104,7 @@ def test_an_edited_number_is_noticed(path, old, new):
         (b"\xff\xfe\x00", "cannot be read as text"),
         (b"format: [\n", "not valid YAML"),
         (b"format: morpheyes-calibration-99\n", "has the format"),
-        (b"format: morpheyes-calibration-1\nmethod: solved\n", "cut short"),
+        (b"format: morpheyes-calibration-1\nmethod: solved\n", "truncated"),
     ],
 )
 def test_other_files_are_refused_by_name(path, content, words):

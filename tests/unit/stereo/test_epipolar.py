@@ -1,4 +1,4 @@
-"""Rows of both eyes: measured to a few hundredths of a pixel, and told apart by cause."""
+"""Rows of both cameras: measured to a few hundredths of a pixel, and told apart by cause."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 
 from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.perception.camera_motion import CameraMotion, row_rates
-from morpheyes_daemon.stereo.epipolar import RowOffsets, RowWatch, row_offsets
+from morpheyes_daemon.stereo.epipolar import RowOffsetEstimator, RowOffsets, row_offsets
 from morpheyes_daemon.stereo.matching import match
 from morpheyes_daemon.transforms import R_from_rotvec, pose
 from tests.support.panels import Panel, ideal_pair, turned_right
@@ -30,20 +30,20 @@ def test_aligned_rows_have_no_offset():
 
 
 @pytest.mark.parametrize("pitch_deg", [-0.2, 0.05, 0.15, 0.3])
-def test_a_pitched_eye_is_recovered(pitch_deg):
+def test_a_pitched_camera_is_recovered(pitch_deg):
     offsets = measured(turned_right((math.radians(pitch_deg), 0.0, 0.0)))
-    fit = RowWatch().add(offsets, PINHOLE)
+    fit = RowOffsetEstimator().add(offsets, PINHOLE)
     # 0.3 degrees are 1.9 px; a fortieth of a pixel is 0.004 degrees
     assert math.degrees(fit.pitch_rad) == pytest.approx(pitch_deg, abs=0.004)
     assert abs(math.degrees(fit.roll_rad)) < 0.03
-    assert math.isinf(fit.late_sigma_s)
-    assert fit.late_s == 0.0
+    assert math.isinf(fit.time_offset_sigma_s)
+    assert fit.time_offset_s == 0.0
 
 
 @pytest.mark.parametrize("roll_deg", [-0.3, 0.2])
-def test_a_rolled_eye_is_recovered(roll_deg):
+def test_a_rolled_camera_is_recovered(roll_deg):
     offsets = measured(turned_right((0.0, 0.0, math.radians(roll_deg))))
-    fit = RowWatch().add(offsets, PINHOLE)
+    fit = RowOffsetEstimator().add(offsets, PINHOLE)
     assert math.degrees(fit.roll_rad) == pytest.approx(roll_deg, abs=0.008)
     assert abs(math.degrees(fit.pitch_rad)) < 0.015
 
@@ -56,27 +56,27 @@ def test_yaw_leaves_the_rows_alone():
 MOTION = (np.array([0.3, -0.2, 2.5]), np.array([0.25, 0.1, -0.15]))
 
 
-def moved(late_s):
-    """How the right eye stands, seen from where it should, when it exposes late."""
+def moved(time_offset_s):
+    """How the right camera stands, seen from where it should, when it exposes late."""
     v, w = MOTION
-    R = R_from_rotvec(w * late_s)
-    # the eye sits at b along x on a rig that turns about the left eye
+    R = R_from_rotvec(w * time_offset_s)
+    # the camera sits at b along x on a rig that turns about the left camera
     at_right = np.array([B, 0.0, 0.0])
-    return pose(R, v * late_s + R @ at_right - at_right)
+    return pose(R, v * time_offset_s + R @ at_right - at_right)
 
 
-@pytest.mark.parametrize("late_s", [0.002, 0.005, 0.010])
-def test_lateness_is_recovered_from_motion(late_s):
-    offsets = measured(moved(late_s))
+@pytest.mark.parametrize("time_offset_s", [0.002, 0.005, 0.010])
+def test_lateness_is_recovered_from_motion(time_offset_s):
+    offsets = measured(moved(time_offset_s))
     rates = row_rates(offsets.uv, offsets.d_px, PINHOLE, B, CameraMotion(np.eye(4), *MOTION))
-    fit = RowWatch().add(offsets, PINHOLE, *rates)
-    assert fit.late_s == pytest.approx(late_s, abs=max(5e-4, 3 * fit.late_sigma_s))
-    assert fit.late_sigma_s < 1e-3
+    fit = RowOffsetEstimator().add(offsets, PINHOLE, *rates)
+    assert fit.time_offset_s == pytest.approx(time_offset_s, abs=max(5e-4, 3 * fit.time_offset_sigma_s))
+    assert fit.time_offset_sigma_s < 1e-3
     assert abs(math.degrees(fit.pitch_rad)) < 0.03
 
 
 def test_a_watch_grows_surer_with_frames_and_forgets_old_ones():
-    watch = RowWatch(memory=0.5)
+    watch = RowOffsetEstimator(memory=0.5)
     bent = measured(turned_right((math.radians(0.2), 0.0, 0.0)))
     first = watch.add(bent, PINHOLE)
     second = watch.add(bent, PINHOLE)
@@ -92,7 +92,7 @@ def test_wrong_matches_do_not_bend_the_explanation():
     dv = offsets.dv_px.copy()
     dv[::6] = 2.5
     spoiled = RowOffsets(offsets.uv, offsets.d_px, dv)
-    fit = RowWatch().add(spoiled, PINHOLE)
+    fit = RowOffsetEstimator().add(spoiled, PINHOLE)
     assert math.degrees(fit.pitch_rad) == pytest.approx(0.1, abs=0.004)
 
 
@@ -102,7 +102,7 @@ def test_nothing_to_see_gives_no_points_and_no_explanation():
     for offsets in (row_offsets(flat, flat, np.zeros_like(unknown)), row_offsets(flat, flat, unknown)):
         assert offsets.count == 0
         assert math.isnan(offsets.median_px)
-        fit = RowWatch().add(offsets, PINHOLE)
+        fit = RowOffsetEstimator().add(offsets, PINHOLE)
         assert math.isinf(fit.pitch_sigma_rad)
         assert fit.count == 0
 

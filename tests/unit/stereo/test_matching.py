@@ -8,8 +8,8 @@ from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import Pinhole
 from morpheyes_daemon.stereo.matching import (
     MatchSettings,
-    _forget_islands,
     _half_occluded,
+    _remove_islands,
     _runs,
     disparity_range,
     match,
@@ -76,7 +76,7 @@ def test_it_beats_the_plain_matcher_and_loses_no_columns(slanted):
     assert np.median(np.abs(ours - truth)[shared]) < 0.75 * np.median(np.abs(plain - truth)[shared])
 
 
-def test_only_what_the_right_eye_cannot_see_is_lost_at_the_left_edge(panel_before_wall):
+def test_only_what_the_right_camera_cannot_see_is_lost_at_the_left_edge(panel_before_wall):
     left, right, truth = panel_before_wall
     found = match(left, right, 64)
     column = np.arange(320)
@@ -87,7 +87,7 @@ def test_only_what_the_right_eye_cannot_see_is_lost_at_the_left_edge(panel_befor
     assert found.half_occluded[outside].mean() > 0.9
 
 
-def test_what_a_nearer_panel_hides_from_the_right_eye_is_told(panel_before_wall):
+def test_what_a_nearer_panel_hides_from_the_right_camera_is_told(panel_before_wall):
     left, right, truth = panel_before_wall
     found = match(left, right, 64)
     partner = np.arange(320) - truth
@@ -136,11 +136,11 @@ def test_a_smaller_range_reports_the_rest_as_near(panel_before_wall):
     assert np.isfinite(found.disparity_px[(truth < 13) & (np.arange(320) > 200)]).mean() > 0.9
 
 
-def test_pixels_that_the_eyes_do_not_cover_are_unknown(slanted):
+def test_pixels_that_the_cameras_do_not_cover_are_unknown(slanted):
     left, right, truth = slanted
-    left_seen, right_seen = np.ones(left.shape, bool), np.ones(left.shape, bool)
-    left_seen[:20], right_seen[:, :50], right_seen[:, 300:] = False, False, False
-    found = match(left, right, 64, left_seen=left_seen, right_seen=right_seen)
+    in_left, in_right = np.ones(left.shape, bool), np.ones(left.shape, bool)
+    in_left[:20], in_right[:, :50], in_right[:, 300:] = False, False, False
+    found = match(left, right, 64, covered=(in_left, in_right))
     partner = np.arange(320) - truth
     assert not np.isfinite(found.disparity_px[:20]).any()
     assert not found.near[:20].any()
@@ -204,14 +204,14 @@ def test_small_patches_in_the_unknown_are_forgotten_and_branches_are_not():
     disparity[20:24, 20:26] = 30.0
     disparity[:, 47:50] = 25.0
     disparity[40:43, 60:66] = 40.0
-    _forget_islands(disparity, 200, 0.8)
+    _remove_islands(disparity, 200, 0.8)
     assert np.isnan(disparity[20:24, 20:26]).all()
     # the branch has unknown on its left only, the patch on the wall nowhere
     assert (disparity[:, 47:50] == 25.0).all()
     assert (disparity[40:43, 60:66] == 40.0).all()
     large = np.full((60, 80), np.nan, np.float32)
     large[10:40, 10:40] = 5.0
-    _forget_islands(large, 200, 0.8)
+    _remove_islands(large, 200, 0.8)
     assert (large[10:40, 10:40] == 5.0).all()
 
 

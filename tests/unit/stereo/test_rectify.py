@@ -77,10 +77,10 @@ def test_maps_are_within_a_hundredth_of_a_pixel_of_the_formulas(size, k1):
     T = pose(R_from_rotvec(np.array([0.01, -0.006, 0.008])), np.array([0.2, 0.002, -0.001]))
     rectification = Rectifier(RigModel.from_poses(lens, lens, [0.2], [T]), size).at(0.2)
     v, u = np.mgrid[0 : size[1], 0 : size[0]].astype(float)
-    for eye in (rectification.cam0, rectification.cam1):
-        rays_cam = rays(rectification.pinhole, np.stack([u, v], axis=-1)) @ eye.R_rect_cam
-        exact = eye.intrinsics.project(rays_cam)
-        assert np.abs(eye.map_px - exact).max() < 0.01
+    for side in (rectification.cam0, rectification.cam1):
+        rays_cam = rays(rectification.pinhole, np.stack([u, v], axis=-1)) @ side.R_rect_cam
+        exact = side.intrinsics.project(rays_cam)
+        assert np.abs(side.map_px - exact).max() < 0.01
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -89,13 +89,13 @@ def test_images_follow_the_maps(channels):
     rng = np.random.default_rng(3)
     shape = (240, 320) if channels == 1 else (240, 320, 3)
     raw = rng.integers(0, 256, shape, dtype=np.uint8)
-    for eye in (rectification.cam0, rectification.cam1):
-        fast = eye.image(raw)
+    for side in (rectification.cam0, rectification.cam1):
+        fast = side.image(raw)
         assert fast.shape == shape
         for _ in range(200):
             row, column = rng.integers(0, 240), rng.integers(0, 320)
             # OpenCV places samples in steps of 1/32 px, of neighbours that differ by up to 255
-            assert np.abs(slow_sample(raw, *eye.map_px[row, column]) - fast[row, column]).max() <= 255 / 32 + 1
+            assert np.abs(slow_sample(raw, *side.map_px[row, column]) - fast[row, column]).max() <= 255 / 32 + 1
 
 
 def slow_sample(image, u, v):
@@ -112,19 +112,19 @@ def slow_sample(image, u, v):
 
 def test_seen_is_where_the_raw_image_reaches():
     rectification = Rectifier(crooked_rig(), (640, 480)).at(0.2)
-    for eye in (rectification.cam0, rectification.cam1):
-        u, v = eye.map_px[..., 0], eye.map_px[..., 1]
+    for side in (rectification.cam0, rectification.cam1):
+        u, v = side.map_px[..., 0], side.map_px[..., 1]
         inside = (u >= 0) & (u <= 639) & (v >= 0) & (v <= 479)
-        assert eye.seen is not None
+        assert side.covered is not None
         # linear interpolation of the distance to the edge moves it by less than the maps' own error
-        assert np.mean(eye.seen != inside) < 1e-3
-        assert 0.9 < eye.seen.mean() < 1.0
+        assert np.mean(side.covered != inside) < 1e-3
+        assert 0.9 < side.covered.mean() < 1.0
 
 
 def test_a_view_that_fits_everywhere_has_no_mask():
     barrel = CameraIntrinsics(640, 480, 740.0, 740.0, 319.5, 239.5, 0.0, (-0.2, 0.05, 0.0, 0.0, 0.0))
     rig = RigModel.from_poses(barrel, barrel, [0.2], [pose(np.eye(3), np.array([0.2, 0.0, 0.0]))])
-    assert rectify(rig, 0.2).cam0.seen is None
+    assert rectify(rig, 0.2).cam0.covered is None
 
 
 def test_rays_and_pixels_are_each_others_inverse():
@@ -133,7 +133,7 @@ def test_rays_and_pixels_are_each_others_inverse():
     assert_allclose(pixels(pinhole, 3.0 * rays(pinhole, uv)), uv)
 
 
-def test_the_rig_frame_lies_midway_between_the_eyes():
+def test_the_rig_frame_lies_midway_between_the_cameras():
     rig = crooked_rig()
     rectification = rectify(rig, 0.25)
     length = rig.length_m(0.25)

@@ -84,7 +84,7 @@ def test_a_smaller_image_has_the_same_poses():
         ([], [], "at least one"),
         ([0.2, 0.1], [straight_pose(0.2), straight_pose(0.1)], "must grow"),
         ([0.1, 0.1], [straight_pose(0.1), straight_pose(0.1)], "none twice"),
-        ([0.1], [straight_pose(-0.1)], "swapped"),
+        ([0.1], [straight_pose(-0.1)], "exchange the left and right images"),
         ([0.1], [straight_pose(np.nan)], "not finite"),
     ],
 )
@@ -93,7 +93,7 @@ def test_rigs_that_cannot_be_are_refused(nominal, poses, words):
         RigModel.from_poses(LENS, LENS, nominal, poses)
 
 
-def test_eyes_of_different_size_are_refused():
+def test_cameras_of_different_size_are_refused():
     with pytest.raises(CalibrationError, match="same image size"):
         RigModel.from_poses(LENS, LENS.rescaled(320, 240), [0.1], [straight_pose(0.1)])
 

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from morpheyes_daemon.stereo.screw import (
     dual_quaternion,
-    dual_quaternion_from_pose,
     exponential,
     inverse,
     logarithm,
@@ -24,7 +23,7 @@ from morpheyes_daemon.stereo.screw import (
     pose_from_dual_quaternion,
     sclerp,
 )
-from morpheyes_daemon.transforms import pose
+from morpheyes_daemon.transforms import pose, q_from_R
 
 TOLERANCE = 1e-9
 """What the issue asks; both sides work in double precision on translations of metres."""
@@ -40,6 +39,10 @@ angle = st.one_of(
 def motion(axis, angle_rad, t):
     rotvec = np.array(axis) / np.linalg.norm(axis) * angle_rad
     return pose(Rotation.from_rotvec(rotvec).as_matrix(), np.array(t))
+
+
+def dual_quaternion_from_pose(T):
+    return dual_quaternion(q_from_R(T[:3, :3]), T[:3, 3])
 
 
 poses = st.builds(motion, unit, angle, translation)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from morpheyes_daemon.errors import ConfigError
+from morpheyes_daemon.messages.core import SECTORS
 from morpheyes_daemon.wire.mavlink import (
     RELEASE,
     ChannelOverride,
@@ -24,7 +25,7 @@ from morpheyes_daemon.wire.mavlink import (
     source,
     text_of,
 )
-from morpheyes_daemon.wire.obstacle_distance import MIN_CM, SECTORS, obstacle_distance_message
+from morpheyes_daemon.wire.obstacle_distance import MIN_CM, obstacle_distance_message
 
 ME = Identity(1, 197)
 KEY = bytes(range(32))
