@@ -83,7 +83,7 @@ class VehicleExamination:
         ]
 
     async def wait(self, done: Callable[[], bool], limit_s: float) -> bool:
-        """Wait until `done()` is true or `limit_s` is over and return which; what ended the connection is raised here."""
+        """Wait until `done()` is true or `limit_s` is over, return which; what ended the connection is raised here."""
         end_ns = self._clock.now_ns() + round(limit_s * S)
         while not done():
             if self._tasks[0].done():

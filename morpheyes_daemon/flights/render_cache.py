@@ -20,7 +20,7 @@ from morpheyes_daemon.messages.core import RawPair, frozen
 
 
 class CachedVehicle(SimVehicle):
-    """A `SimVehicle` of one world and rig with its own `folder`; it renders in one thread, since threads end at a fork."""
+    """A `SimVehicle` of one world and rig with its own `folder`; it renders in one thread: threads end at a fork."""
 
     def __init__(self, scenario: Scenario, config: VehicleConfig, clock: Clock, folder: Path) -> None:
         super().__init__(scenario, config, clock)

@@ -24,6 +24,7 @@ class ImageFault(StrEnum):
     text: str
 
     def __new__(cls, code: str, text: str) -> ImageFault:
+        """Make a member of its code and text."""
         member = str.__new__(cls, code)
         member._value_ = code
         member.text = text

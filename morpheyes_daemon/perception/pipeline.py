@@ -68,6 +68,7 @@ class PipelineFactory:
     calibration: Path
 
     def __call__(self) -> Pipeline:
+        """Return a pipeline; raises CalibrationError when the file cannot be used."""
         return Pipeline(self.config, self.mission, read_calibration(self.calibration))
 
 

@@ -22,6 +22,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "morpheyes_daemon.safety"
@@ -118,7 +119,7 @@ OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
 EXTREMES = {"min": "max", "max": "min", "any": "all", "all": "any"}
 ENUMS = {"State": "State", "Trigger": "Trigger", "Action": "Action", "Lease": "Lease", "_S": "State", "_T": "Trigger"}
 
-Change = Callable[[ast.AST], None]
+Change = Callable[[Any], object]
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """mavsdk beside the connection: health, battery, texts and actions for doctor, dashboard and ground crews.
 
 mavsdk gets the frames that the connection received over its `raw://` connection, and what it wants to send goes back
-through the connection, which filters, numbers and signs it; mavsdk opens no port. It runs threads of its own, so it has no
-place in lockstep, and nothing that keeps the vehicle safe or steers it depends on it: its flight mode reads Loiter,
-Brake and FlowHold all as HOLD, and its `hold()` sends BRAKE.
+through the connection, which filters, numbers and signs it; mavsdk opens no port. It runs threads of its own, so it
+has no place in lockstep, and nothing that keeps the vehicle safe or steers it depends on it: its flight mode reads
+Loiter, Brake and FlowHold all as HOLD, and its `hold()` sends BRAKE.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morpheyes_daemon.messages.core import Pinhole
+from morpheyes_daemon.messages.core import Image, Pinhole
 from morpheyes_daemon.perception.image_checks import (
     FrozenCheck,
     ImageFault,
@@ -22,8 +22,11 @@ PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)
 PANELS = [Panel(5.0, slope_x=0.3), Panel(2.5, x_m=(-0.3, 0.6), y_m=(-0.5, 0.3), seed=3)]
 
 
+Pair = tuple[Image, Image]
+
+
 @pytest.fixture(scope="module")
-def pair():
+def pair() -> Pair:
     left, right, _ = ideal_pair(PANELS, PINHOLE, 0.2, 1.5)
     return left, right
 
@@ -32,14 +35,14 @@ def valid_fraction(left, right):
     return float(np.isfinite(match(left, right, 80).disparity_px).mean())
 
 
-def test_a_good_pair_has_no_fault(pair):
+def test_a_good_pair_has_no_fault(pair: Pair):
     assert exposure_faults(*pair) == set()
     assert matching_faults(*pair, valid_fraction(*pair)) == set()
     # not even when something else says that depth is scarce
     assert matching_faults(*pair, 0.0) == set()
 
 
-def test_the_same_image_again_is_frozen_in_either_eye(pair):
+def test_the_same_image_again_is_frozen_in_either_eye(pair: Pair):
     left, right = pair
     noisy = left ^ np.uint8(1)
     check = FrozenCheck()
@@ -50,7 +53,7 @@ def test_the_same_image_again_is_frozen_in_either_eye(pair):
     assert not check.check(left[:100], right[:100])
 
 
-def test_one_changed_pixel_is_not_frozen(pair):
+def test_one_changed_pixel_is_not_frozen(pair: Pair):
     left, right = pair
     check = FrozenCheck()
     check.check(left, right)
@@ -70,33 +73,34 @@ def test_one_changed_pixel_is_not_frozen(pair):
         (lambda image: np.full_like(image, 120), ImageFault.BLANK),
     ],
 )
-def test_an_eye_that_sees_nothing_is_told(pair, eye, spoil, fault):
+def test_an_eye_that_sees_nothing_is_told(pair: Pair, eye, spoil, fault):
     images = list(pair)
     images[eye] = spoil(images[eye]).astype(np.uint8)
-    assert exposure_faults(*images) == {fault}
+    left, right = images
+    assert exposure_faults(left, right) == {fault}
 
 
-def test_dusk_and_bright_sky_are_no_faults(pair):
-    dusk = tuple(image // 8 for image in pair)
-    assert exposure_faults(*dusk) == set()
-    sky = tuple(np.where(np.arange(240)[:, None] < 90, 255, image).astype(np.uint8) for image in pair)
-    assert exposure_faults(*sky) == set()
+def test_dusk_and_bright_sky_are_no_faults(pair: Pair):
+    left, right = (image // 8 for image in pair)
+    assert exposure_faults(left, right) == set()
+    left, right = (np.where(np.arange(240)[:, None] < 90, 255, image).astype(np.uint8) for image in pair)
+    assert exposure_faults(left, right) == set()
 
 
-def test_swapped_eyes_are_told(pair):
+def test_swapped_eyes_are_told(pair: Pair):
     left, right = pair
     assert matching_faults(right, left, valid_fraction(right, left)) == {ImageFault.SWAPPED}
 
 
 @pytest.mark.parametrize("rows", [-14, 8, 20])
-def test_rows_far_off_are_told(pair, rows):
+def test_rows_far_off_are_told(pair: Pair, rows):
     left, right = pair
     off = np.roll(right, rows, axis=0)
     assert matching_faults(left, off, valid_fraction(left, off)) == {ImageFault.MISALIGNED}
 
 
 @pytest.mark.parametrize("rows", [-7, 0, 5])
-def test_the_row_shift_is_found_in_spite_of_parallax(pair, rows):
+def test_the_row_shift_is_found_in_spite_of_parallax(pair: Pair, rows):
     left, right = pair
     assert abs(row_shift(left, np.roll(right, rows, axis=0)) - rows) <= 1
 
@@ -124,12 +128,12 @@ def ask(check, left, right, disparity_px):
     return check.check(left, row_offsets(left, right, disparity_px), F_PX)
 
 
-def test_eyes_that_see_the_same_are_alike(pair):
+def test_eyes_that_see_the_same_are_alike(pair: Pair):
     check = PairCheck()
     assert [ask(check, *pair, disparity(*pair)) for _ in range(6)] == [set()] * 6
 
 
-def test_eyes_that_see_different_things_are_told_after_three_frames(pair):
+def test_eyes_that_see_different_things_are_told_after_three_frames(pair: Pair):
     left, right = pair
     wrong = disparity(left, right) + 12
     check = PairCheck()
@@ -138,14 +142,14 @@ def test_eyes_that_see_different_things_are_told_after_three_frames(pair):
     assert ask(check, left, right, disparity(left, right)) == set(), "two good frames clear it"
 
 
-def test_a_row_apart_is_no_fault(pair):
+def test_a_row_apart_is_no_fault(pair: Pair):
     left, right = pair
     apart = np.roll(right, 1, axis=0)
     check = PairCheck()
     assert [ask(check, left, apart, disparity(left, apart)) for _ in range(9)] == [set()] * 9
 
 
-def test_rows_that_stay_apart_are_told_after_five_frames(pair):
+def test_rows_that_stay_apart_are_told_after_five_frames(pair: Pair):
     left, right = pair
     apart, wrong, good = np.roll(right, 2, axis=0), disparity(left, right), (left, right, disparity(left, right))
     check = PairCheck()
@@ -154,7 +158,7 @@ def test_rows_that_stay_apart_are_told_after_five_frames(pair):
     assert [ask(check, *good) for _ in range(4)] == [{ImageFault.APART}] * 3 + [set()], "four bad frames of eight"
 
 
-def test_few_places_of_which_none_is_found_again_are_told(pair):
+def test_few_places_of_which_none_is_found_again_are_told(pair: Pair):
     """Swapped eyes in a dense view: hardly a place has a depth at all."""
     nothing = RowOffsets(np.empty((0, 2)), np.empty(0), np.empty(0), tried=45)
     check = PairCheck()
@@ -164,14 +168,14 @@ def test_few_places_of_which_none_is_found_again_are_told(pair):
 
 
 @pytest.mark.parametrize(("rows_px", "told"), [(0.0005 * F_PX, False), (0.002 * F_PX, True)])
-def test_few_places_that_are_found_again_vouch_for_the_eyes_when_their_rows_agree(pair, rows_px, told):
+def test_few_places_that_are_found_again_vouch_for_the_eyes_when_their_rows_agree(pair: Pair, rows_px, told):
     """All that is seen is far and hazy, or the few partners are false."""
     few = RowOffsets(np.zeros((20, 2)), np.full(20, 3.0), np.full(20, rows_px), tried=90)
     check = PairCheck()
     assert [bool(check.check(pair[0], few, F_PX)) for _ in range(4)] == [False, False, told, told]
 
 
-def test_rows_far_apart_are_told_after_three_frames_like_eyes_that_see_different_things(pair):
+def test_rows_far_apart_are_told_after_three_frames_like_eyes_that_see_different_things(pair: Pair):
     """Swapped eyes find false partners far off their rows."""
     left, right = pair
     apart, wrong = np.roll(right, 5, axis=0), disparity(left, right)
@@ -180,7 +184,7 @@ def test_rows_far_apart_are_told_after_three_frames_like_eyes_that_see_different
     assert [ask(check, left, apart, wrong) for _ in range(4)] == [set(), set()] + [{ImageFault.UNLIKE}] * 2
 
 
-def test_rows_no_farther_apart_than_the_doubt_in_where_the_eyes_point_are_no_fault(pair):
+def test_rows_no_farther_apart_than_the_doubt_in_where_the_eyes_point_are_no_fault(pair: Pair):
     left, right = pair
     apart = np.roll(right, 2, axis=0)
     offsets = row_offsets(left, apart, disparity(left, apart))
@@ -192,7 +196,7 @@ def test_rows_no_farther_apart_than_the_doubt_in_where_the_eyes_point_are_no_fau
     assert found == {0.0: {ImageFault.APART}, 1e-3: {ImageFault.APART}, 4e-3: set()}
 
 
-def test_rows_apart_for_a_moment_are_no_fault(pair):
+def test_rows_apart_for_a_moment_are_no_fault(pair: Pair):
     """As in a quick pitch, where 2 ms between the eyes show."""
     left, right = pair
     apart, depth = np.roll(right, 2, axis=0), disparity(left, right)

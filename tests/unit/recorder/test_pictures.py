@@ -1,6 +1,7 @@
 """Map, strips and film show the flight, to scale and in the right colours."""
 
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -45,7 +46,7 @@ def forest_flight(seconds: float = 20.0) -> FlightSeries:
     return series
 
 
-def share_of(picture: np.ndarray, bgr: tuple[int, int, int], tolerance: int = 6) -> float:
+def share_of(picture: Any, bgr: tuple[int, int, int], tolerance: int = 6) -> float:
     return float((np.abs(picture.astype(int) - np.array(bgr)).max(axis=2) <= tolerance).mean())
 
 

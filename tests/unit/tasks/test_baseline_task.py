@@ -98,7 +98,7 @@ def moved_by(servo: ListeningServo, model: BaselineModel, told: Callable[[bool],
     async def run() -> None:
         clock = running_clock()
         work = baseline(
-            servo,  # type: ignore[arg-type]
+            servo,
             model,
             BaselinePlanner(motion),
             0.1,
