@@ -1,6 +1,6 @@
 """How far the vehicle still goes after the sticks go neutral in Loiter, as a table made from its own parameters.
 
-The plant is the one identified on recorded brakes (docs/decisions.md): dead time, lean angle through a critically
+The plant is the one identified on recorded brakes (docs/decisions, 0006): dead time, lean angle through a critically
 damped second order, drag, and a brake that starts LOIT_BRK_DELAY after the stick is neutral, with a square-root
 controller on speed slewed at LOIT_BRK_JERK (AC_Loiter::calc_desired_velocity). It knows no sticks.
 """
