@@ -39,7 +39,7 @@ def install(extra: str) -> None:
     if not program("python").exists():
         make_environment()
     print(f"Installing MorphEyes with its {extra} packages; this takes a minute or two ...", flush=True)
-    pip = [program("python"), "-m", "pip"]
+    pip = [str(program("python")), "-m", "pip"]
     if subprocess.run([*pip, "--version"], capture_output=True).returncode:
         pip = [sys.executable, "-m", "pip", "--python", str(program("python"))]
     subprocess.run([*pip, "install", "-q", "--disable-pip-version-check", "-e", f"{ROOT}[{extra}]"], check=True)

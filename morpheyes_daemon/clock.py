@@ -33,9 +33,11 @@ class MonotonicClock:
     """The machine's monotonic clock."""
 
     def now_ns(self) -> int:
+        """Return the monotonic time in nanoseconds."""
         return time.monotonic_ns()
 
     async def sleep_until_ns(self, t_ns: int) -> None:
+        """Sleep until `t_ns`; yields once even when `t_ns` has passed."""
         await asyncio.sleep(max(0.0, (t_ns - self.now_ns()) / S))
 
 
@@ -46,9 +48,11 @@ class VirtualClock:
         self._loop = loop
 
     def now_ns(self) -> int:
+        """Return the virtual time in nanoseconds."""
         return round(self._loop.time() * S)
 
     async def sleep_until_ns(self, t_ns: int) -> None:
+        """Sleep until virtual time `t_ns`; yields once even when `t_ns` has passed."""
         await asyncio.sleep(max(0.0, (t_ns - self.now_ns()) / S))
 
 
@@ -76,6 +80,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         super().__init__(selector)
 
     def time(self) -> float:
+        """Return the virtual time in seconds."""
         return self._virtual_s
 
     def leap(self, seconds: float) -> None:

@@ -43,6 +43,8 @@ class Mount(Section):
 
 
 class CameraBase(Section):
+    """What every camera backend has: image size, frame rate, mount."""
+
     width_px: int = Field(640, ge=160, le=4096)
     height_px: int = Field(480, ge=120, le=3072)
     rate_hz: float = Field(5.0, gt=0.1, le=120, description="stereo pairs per second")

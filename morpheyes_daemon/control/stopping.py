@@ -1,6 +1,6 @@
 """Stopping distance after the sticks go neutral in Loiter, as a table made from the vehicle's own parameters.
 
-The plant was identified on recorded stops (docs/decisions.md): dead time, lean angle as a critically damped second
+The plant was identified on recorded stops (docs/decisions, 0006): dead time, lean angle as a critically damped second
 order, drag, and a brake that starts LOIT_BRK_DELAY after the stick is neutral, with a square-root controller on speed
 slewed at LOIT_BRK_JERK (AC_Loiter::calc_desired_velocity). Speeds only, no sticks.
 """

@@ -169,7 +169,7 @@ def _observer_job(pipeline: PipelineFactory, mission_name: str, journal: int | N
 
 
 def _mavsdk(daemon: Daemon, clock: Clock) -> Task:
-    """mavsdk beside the connection; the daemon flies without it as well."""
+    """Mavsdk beside the connection; the daemon flies without it as well."""
     bridge = MavsdkBridge(daemon.connection, daemon.config.autopilot, clock)
 
     async def listen(pulse: Pulse) -> None:

@@ -58,6 +58,7 @@ class MemoryLink:
         return a, b
 
     def write(self, data: bytes) -> None:
+        """Deliver `data` to the other end after the delay; dropped when either end is closed."""
         if self.closed or self._peer is None:
             return
         self._peer._arriving.append(data)
@@ -70,6 +71,7 @@ class MemoryLink:
             self.on_bytes(data)
 
     def close(self) -> None:
+        """Close this end; what is still under way is dropped."""
         self.closed = True
 
 

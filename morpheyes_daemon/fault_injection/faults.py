@@ -37,18 +37,22 @@ DISARM_AFTER_S = 0.4
 
 
 def stall_camera(flight: FaultFlight) -> None:
+    """The camera delivers no more frames."""
     flight.camera.stalled = True
 
 
 def restart_camera(flight: FaultFlight) -> None:
+    """A stalled camera delivers frames again."""
     flight.camera.stalled = False
 
 
 def unplug_camera(flight: FaultFlight) -> None:
+    """The camera is disconnected."""
     flight.camera.plugged = False
 
 
 def plug_camera_in(flight: FaultFlight) -> None:
+    """The camera is connected again."""
     flight.camera.plugged = True
 
 
@@ -72,6 +76,7 @@ def desynchronize(offset_ms: float) -> Act:
 
 
 def burn_out(flight: FaultFlight) -> None:
+    """Fixed exposure far too long: both images saturate."""
     camera = flight.stage.camera
     camera.sensor = replace(camera.sensor, auto_exposure=False, exposure=40.0)
 
@@ -80,18 +85,22 @@ def burn_out(flight: FaultFlight) -> None:
 
 
 def slow_worker(flight: FaultFlight) -> None:
+    """Each depth map takes one second longer."""
     flight.worker.extra_ns = 1_000_000_000
 
 
 def hang_worker(flight: FaultFlight) -> None:
+    """The vision worker no longer answers."""
     flight.worker.hung_s = WORKER_TIMEOUT_S
 
 
 def kill_worker(flight: FaultFlight) -> None:
+    """The vision worker dies by a signal."""
     flight.worker.gone = WorkerLost("The vision worker died (signal 9); a new one is being started.")
 
 
 def crash_pipeline(flight: FaultFlight) -> None:
+    """The pipeline in the vision worker raises an unexpected error."""
     flight.worker.gone = WorkerFailed("ValueError: something unforeseen")
 
 
@@ -104,6 +113,7 @@ def kill_idle_worker(flight: FaultFlight) -> None:
 
 
 def mend_worker(flight: FaultFlight) -> None:
+    """The vision worker works as before."""
     flight.worker.gone, flight.worker.hung_s, flight.worker.extra_ns = None, None, 0
 
 
@@ -121,6 +131,7 @@ def engage(flight: FaultFlight) -> None:
 
 
 def reboot_servo(flight: FaultFlight) -> None:
+    """The Teensy restarts."""
     flight.stage.teensy.reboot()
 
 
@@ -128,38 +139,47 @@ def reboot_servo(flight: FaultFlight) -> None:
 
 
 def lose_link(flight: FaultFlight) -> None:
+    """Nothing passes between daemon and autopilot in either direction."""
     flight.wire.incoming = flight.wire.outgoing = injectors.lose
 
 
 def lose_downlink(flight: FaultFlight) -> None:
+    """Nothing arrives from the autopilot."""
     flight.wire.incoming = injectors.lose
 
 
 def lose_uplink(flight: FaultFlight) -> None:
+    """Nothing reaches the autopilot."""
     flight.wire.outgoing = injectors.lose
 
 
 def mend_link(flight: FaultFlight) -> None:
+    """Both directions of the link pass bytes again."""
     flight.wire.incoming = flight.wire.outgoing = injectors.pass_on
 
 
 def unplug_link(flight: FaultFlight) -> None:
+    """The autopilot's port disappears."""
     flight.wire.unplug()
 
 
 def noisy_link(flight: FaultFlight) -> None:
+    """Random bytes are inserted into what arrives."""
     flight.wire.incoming = injectors.add_noise(flight.rng)
 
 
 def cutting_link(flight: FaultFlight) -> None:
+    """Messages arrive truncated."""
     flight.wire.incoming = injectors.cut_short(flight.rng)
 
 
 def swapping_link(flight: FaultFlight) -> None:
+    """Neighbouring messages arrive in swapped order."""
     flight.wire.incoming = injectors.swap_neighbours()
 
 
 def doubling_link(flight: FaultFlight) -> None:
+    """Each message arrives twice, in both directions."""
     flight.wire.incoming = flight.wire.outgoing = injectors.double
 
 
@@ -180,10 +200,12 @@ def forge(flight: FaultFlight) -> None:
 
 
 def reboot_autopilot(flight: FaultFlight) -> None:
+    """The autopilot restarts in flight."""
     flight.stage.autopilot.reboot()
 
 
 def ignore_overrides(flight: FaultFlight) -> None:
+    """The autopilot ignores RC overrides."""
     flight.stage.autopilot.ignore_overrides()
 
 
@@ -200,14 +222,17 @@ def switch_mode(mode: Mode) -> Act:
 
 
 def switch_off(flight: FaultFlight) -> None:
+    """The pilot turns the engage switch off."""
     flight.stage.radio.switch(on=False)
 
 
 def switch_on(flight: FaultFlight) -> None:
+    """The pilot turns the engage switch on."""
     flight.stage.radio.switch(on=True)
 
 
 def disarm(flight: FaultFlight) -> None:
+    """The motors are disarmed in flight."""
     flight.stage.autopilot.disarm_in_flight()
 
 
@@ -234,22 +259,27 @@ def disarm_without_radio(flight: FaultFlight) -> None:
 
 
 def upset_ekf(flight: FaultFlight) -> None:
+    """The autopilot's EKF reports that it is unhealthy."""
     flight.stage.autopilot.ekf_unhealthy()
 
 
 def lose_aiding(flight: FaultFlight) -> None:
+    """The optical flow sensor falls silent."""
     flight.stage.autopilot.lose_flow()
 
 
 def drain_battery(flight: FaultFlight) -> None:
+    """The battery falls to 10 %."""
     flight.stage.autopilot.battery_low(0.1)
 
 
 def lose_ground_station(flight: FaultFlight) -> None:
+    """The ground station sends no more heartbeats."""
     flight.crew_task.cancel()
 
 
 def lose_radio(flight: FaultFlight) -> None:
+    """The pilot's radio is no longer received."""
     flight.stage.autopilot.lose_radio()
 
 
@@ -308,10 +338,12 @@ def step_wall_clock(flight: FaultFlight) -> None:
 
 
 def terminate(flight: FaultFlight) -> None:
+    """The daemon receives SIGTERM."""
     flight.stop.set()
 
 
 def die(flight: FaultFlight) -> None:
+    """The daemon is killed (SIGKILL)."""
     flight.die()
 
 

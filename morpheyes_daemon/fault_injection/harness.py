@@ -282,6 +282,7 @@ class TruePath:
         self.clearance_m = math.inf
 
     def sample(self, t_ns: int) -> None:
+        """Take the vehicle's true state at `t_ns` into account."""
         truth = self._stage.truth(t_ns)
         place = float(truth.p_ned_m[0]), float(truth.p_ned_m[1])
         if self._last is not None:

@@ -14,6 +14,7 @@ class Reason(StrEnum):
     text: str
 
     def __new__(cls, code: str, number: int, text: str) -> "Reason":
+        """Make a member of its code, NAMED_VALUE_INT number and text."""
         member = str.__new__(cls, code)
         member._value_ = code
         member.number = number

@@ -78,7 +78,7 @@ def is_text(statement: ast.stmt) -> bool:
 
 def docstring(statement: ast.stmt) -> str:
     is_text = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
-    return str(statement.value.value) if is_text and isinstance(statement.value.value, str) else ""
+    return str(statement.value.value) if is_text and isinstance(statement.value.value, str) else ""  # type: ignore[attr-defined]
 
 
 def faults(constant: Constant) -> list[str]:

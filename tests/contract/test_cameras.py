@@ -67,7 +67,7 @@ def read_all(config: RecordingCameraConfig, count: int) -> list[RawPair]:
 
 def values(pairs: list[RawPair]) -> list[tuple[int, int]]:
     """Grey values of left and right, to the nearest ten (JPEG and video are lossy)."""
-    return [(round(float(p.left.mean()), -1), round(float(p.right.mean()), -1)) for p in pairs]
+    return [(10 * round(float(p.left.mean()) / 10), 10 * round(float(p.right.mean()) / 10)) for p in pairs]
 
 
 def test_side_by_side_files_come_in_natural_order_at_their_rate(tmp_path: Path) -> None:

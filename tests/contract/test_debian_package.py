@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,7 +27,7 @@ pytestmark = [
 ]
 
 
-def run(*command: object, **more: object) -> str:
+def run(*command: object, **more: Any) -> str:
     done = subprocess.run([str(part) for part in command], capture_output=True, text=True, timeout=120, **more)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

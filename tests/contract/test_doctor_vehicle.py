@@ -12,6 +12,7 @@ import pytest
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.config.vehicle import AutopilotConfig, NoServoConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.devices.autopilot.parameters import parameter_file
+from morpheyes_daemon.devices.link import Link, OnBytes, OnLost
 from morpheyes_daemon.doctor.findings import Finding, Severity, Verdict, remedies, verdict
 from morpheyes_daemon.doctor.takeover import HandOver, TakeoverTest
 from morpheyes_daemon.doctor.vehicle import VehicleExamination
@@ -25,7 +26,7 @@ def config(**autopilot: object) -> VehicleConfig:
     return VehicleConfig(
         camera=SimCameraConfig(),
         servo=NoServoConfig(backend="none"),
-        autopilot=AutopilotConfig(**autopilot),  # type: ignore[arg-type]
+        autopilot=AutopilotConfig(**autopilot),
     )
 
 
@@ -124,18 +125,18 @@ def test_radio_without_the_switch_channel() -> None:
 
 def test_slow_link_is_noticed() -> None:
     async def story(bench: ConnectionBench) -> None:
-        async def thin(url: str, on_bytes: object, on_lost: object) -> object:
+        async def thin(url: str, on_bytes: OnBytes, on_lost: OnLost) -> Link:
             count = 0
 
             def pass_some(data: bytes) -> None:
                 nonlocal count
                 count += 1
                 if data[7] not in (30, 65) or count % 3 == 0:
-                    on_bytes(data)  # type: ignore[operator]
+                    on_bytes(data)
 
-            return await bench.open(url, pass_some, on_lost)  # type: ignore[arg-type]
+            return await bench.open(url, pass_some, on_lost)
 
-        async with VehicleExamination(config(), bench.clock, thin) as vehicle:  # type: ignore[arg-type]
+        async with VehicleExamination(config(), bench.clock, thin) as vehicle:
             findings = await vehicle.examine()
         slow = [finding for finding in findings if finding.id == "link-slow"]
         assert any("attitude" in finding.evidence for finding in slow)

@@ -6,7 +6,7 @@ import asyncio
 import os
 import socket
 import tty
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -61,10 +61,10 @@ async def server() -> AsyncIterator[Server]:
 
 
 @pytest.fixture
-def pty() -> AsyncIterator[tuple[int, str]]:
+def pty() -> Iterator[tuple[int, str]]:
     master, slave = os.openpty()
     tty.setraw(slave)
-    yield master, os.ttyname(slave)  # type: ignore[misc]
+    yield master, os.ttyname(slave)
     for fd in (master, slave):
         try:
             os.close(fd)

@@ -40,7 +40,7 @@ class Session:
         self.topics, log = Topics.create(), EventLog()
         self.reasons: list[Reason] = []
         log.subscribe(lambda event: self.reasons.append(event.reason))
-        settings = AutopilotConfig(url=URL, **config)  # type: ignore[arg-type]
+        settings = AutopilotConfig(url=URL, **config)
         self.connection = AutopilotConnection(settings, self.clock, self.topics, log, open_link)
         self.output = self.connection.claim_stick_output()
 

@@ -126,7 +126,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if "MORPHEYES_DEBIAN_PACKAGE" in os.environ:
         return Path(os.environ["MORPHEYES_DEBIAN_PACKAGE"])
     build = [sys.executable, ROOT / "systemd/debian/build.py", "--out", tmp_path_factory.mktemp("dist")]
-    done = subprocess.run(build, capture_output=True, text=True, timeout=1200)
+    done = subprocess.run(build, capture_output=True, text=True, timeout=1200)  # type: ignore[arg-type]
     assert done.returncode == 0, done.stderr
     return Path(done.stdout.strip().splitlines()[-1])
 

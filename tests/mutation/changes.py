@@ -155,14 +155,14 @@ def _changes(node: ast.AST, members: Members, skipped: set[int]) -> Iterator[tup
         for i in range(len(node.values)):
             yield line, f"drop term {i}", lambda n, i=i: _drop_term(n, i)
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
-        yield line, "drop not", lambda n: setattr(n, "operand", ast.UnaryOp(ast.Not(), n.operand))
+        yield line, "drop not", lambda n: setattr(n, "operand", ast.UnaryOp(ast.Not(), n.operand))  # type: ignore[attr-defined]
     elif isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
         operator = OPERATORS[type(node.op)]
         yield line, f"{_name(node.op)} to {operator.__name__}", lambda n: setattr(n, "op", operator())
     elif isinstance(node, ast.Constant):
         yield from _constant(node)
     elif isinstance(node, ast.Name) and node.id in EXTREMES:
-        yield line, f"{node.id} to {EXTREMES[node.id]}", lambda n: setattr(n, "id", EXTREMES[n.id])
+        yield line, f"{node.id} to {EXTREMES[node.id]}", lambda n: setattr(n, "id", EXTREMES[n.id])  # type: ignore[attr-defined]
     elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in members:
         names = members[node.value.id]
         if node.attr in names:
@@ -188,12 +188,12 @@ def _is_table(node: ast.Set | ast.Tuple) -> bool:
 def _constant(node: ast.Constant) -> Iterator[tuple[int, str, Change]]:
     value = node.value
     if isinstance(value, bool):
-        yield node.lineno, f"{value} to {not value}", lambda n: setattr(n, "value", not n.value)
+        yield node.lineno, f"{value} to {not value}", lambda n: setattr(n, "value", not n.value)  # type: ignore[attr-defined]
     elif isinstance(value, int | float):
-        yield node.lineno, f"{value} plus 1", lambda n: setattr(n, "value", n.value + 1)
-        yield node.lineno, f"{value} minus 1", lambda n: setattr(n, "value", n.value - 1)
+        yield node.lineno, f"{value} plus 1", lambda n: setattr(n, "value", n.value + 1)  # type: ignore[attr-defined]
+        yield node.lineno, f"{value} minus 1", lambda n: setattr(n, "value", n.value - 1)  # type: ignore[attr-defined]
     elif isinstance(value, str):
-        yield node.lineno, "another text", lambda n: setattr(n, "value", f"{n.value}?")
+        yield node.lineno, "another text", lambda n: setattr(n, "value", f"{n.value}?")  # type: ignore[attr-defined]
 
 
 def _statements(node: ast.AST, skipped: set[int]) -> Iterator[tuple[int, str, Change]]:

@@ -20,7 +20,7 @@ from morpheyes_daemon.perception.craft import build_craft
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.replay import replay
-from morpheyes_daemon.strategies.base import Strategy, StrategyParameters
+from morpheyes_daemon.strategies.base import Craft, Strategy, StrategyParameters
 from morpheyes_daemon.strategies.registry import BUILT_IN
 from tests.support.hand_clock import HandClock
 
@@ -44,7 +44,7 @@ class Weaver(Strategy):
 
     Parameters = WeaverParameters
 
-    def __init__(self, parameters: StrategyParameters, craft: object) -> None:
+    def __init__(self, parameters: StrategyParameters, craft: Craft) -> None:
         super().__init__(parameters, craft)
         self._sum = 0.0
 

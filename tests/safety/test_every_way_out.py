@@ -106,7 +106,7 @@ def break_task(flight: Flight, name: str) -> None:
     daemon = flight.noisy.daemon
     if name == "supervisor":
         real = daemon.gate.renew
-        daemon.supervisor._gate.renew = lambda lease, t_ns: (  # type: ignore[method-assign]
+        daemon.supervisor._gate.renew = lambda lease, t_ns: (  # type: ignore[method-assign, assignment]
             raising() if lease is Lease.SUPERVISOR else real(lease, t_ns)
         )
     else:

@@ -114,7 +114,10 @@ BAD: list[tuple[Ending, dict[str, object]]] = [
     (Ending.STOPS, {"stopped": False}),
     (Ending.STOPS, {"stop_m": 4.1}),
     (Ending.STOPS, {"sticks_after": 1}),
-    *((ending, {"clearance_m": -0.01}) for ending in (Ending.FLIES, Ending.HOLDS, Ending.LETS_GO, Ending.STOPS)),
+    (Ending.FLIES, {"clearance_m": -0.01}),
+    (Ending.HOLDS, {"clearance_m": -0.01}),
+    (Ending.LETS_GO, {"clearance_m": -0.01}),
+    (Ending.STOPS, {"clearance_m": -0.01}),
 ]
 
 

@@ -38,7 +38,7 @@ class Chaos(Cockpit):
             self.heartbeat(armed=False, landed=True)
         self._events = (
             self._flip, self._flip, self._flip, self._flip, self._flip, self._flick, self._mode, self._disarm,
-            self._heal, self._heal, self._heal, self._heal, self._lose, self._lose, self._find, self._find,
+            self._heal, self._heal, self._heal, self._heal, self._lose_any, self._lose_any, self._find, self._find,
             self._fail, self._mend, self._mend, self._mend, self._finish, self._trouble,
             self._pause, self._jump_back, self._wrong_stamp, self._wrong_numbers, self._change_limits,
             self._overtaken, self._absent, self._early_offer, self._land, self._revoke,
@@ -69,7 +69,8 @@ class Chaos(Cockpit):
                 if lease not in self.silent:
                     self.renew(lease, 300 * MS)
         if self.state is State.ENGAGED or rng.random() < 0.02:
-            self.offer(tuple(rng.uniform(900.0, 2100.0) for _ in range(4)), rng.choice((20, 100, 300)) * MS)
+            a, b, c, d = (rng.uniform(900.0, 2100.0) for _ in range(4))
+            self.offer((a, b, c, d), rng.choice((20, 100, 300)) * MS)
         self.step()
 
     def _flip(self) -> None:
@@ -98,7 +99,7 @@ class Chaos(Cockpit):
         self.silent.clear()
         self.heartbeat(**HEALTHY, ekf_t_ns=self.now_ns, battery_fraction=self._rng.choice((math.nan, 0.9)))
 
-    def _lose(self) -> None:
+    def _lose_any(self) -> None:
         self.silent.add(self._rng.choice(list(Lease)))
 
     def _find(self) -> None:
@@ -136,7 +137,8 @@ class Chaos(Cockpit):
             self.motion(v_ned_m_s=(self._rng.choice(WILD), 0.0, 0.0))
             self.motion(v_ned_m_s=(0.0, 0.0, 0.0))
         else:
-            self.offer(tuple(self._rng.choice(WILD) for _ in range(4)), self._rng.choice((MS, S, 3600 * S)))
+            a, b, c, d = (self._rng.choice(WILD) for _ in range(4))
+            self.offer((a, b, c, d), self._rng.choice((MS, S, 3600 * S)))
 
     def _change_limits(self) -> None:
         self.set_limits(self._rng.choice((LIMITS, OTHER_LIMITS)))

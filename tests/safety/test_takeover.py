@@ -119,7 +119,8 @@ def test_a_thousand_take_overs_at_random_times() -> None:
         cockpit.run(0.28)
         cockpit.engage()
         for _ in range(rng.randrange(20)):
-            cockpit.wanted = tuple(rng.uniform(1000, 2000) for _ in range(4))
+            a, b, c, d = (rng.uniform(1000, 2000) for _ in range(4))
+            cockpit.wanted = a, b, c, d
             if rng.random() < 0.05:
                 cockpit.silent = set(rng.sample(list(Lease), rng.randrange(3)))
             cockpit.period()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from morpheyes_daemon.errors import MorphEyesError
+from morpheyes_daemon.errors import ConfigError, MorphEyesError
 from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.flights.lockstep import Watchers, fly
 from morpheyes_daemon.messages.core import MissionCommand
@@ -102,5 +102,5 @@ def test_a_mistake_in_a_strategy_is_named_with_its_line(
 def test_a_strategy_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     point = EntryPoint("odd", "pathlib:Path", "morpheyes.strategies")
     monkeypatch.setattr(registry, "entry_points", lambda group: [point])
-    with pytest.raises(registry.ConfigError, match="not a subclass"):
+    with pytest.raises(ConfigError, match="not a subclass"):
         registry.find_strategy("odd")

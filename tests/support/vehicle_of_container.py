@@ -83,7 +83,7 @@ def witness(stage: TwinVehicle) -> None:
         take(t_ns, values)
         tell(override=list(values[:4]), t_ns=t_ns)
 
-    rc.override = override  # type: ignore[method-assign]
+    rc.override = override  # type: ignore[method-assign, assignment]
 
 
 async def main(root: Path) -> None:

@@ -14,7 +14,7 @@ from morpheyes_daemon.errors import mistake
 @pytest.mark.parametrize(
     ("slip", "says"),
     [
-        (lambda: {}["nothing"], "KeyError: 'nothing'"),
+        (lambda: dict[str, int]()["nothing"], "KeyError: 'nothing'"),
         (lambda: json.loads("{"), "JSONDecodeError: "),
         (lambda: np.linalg.inv(np.zeros((2, 2))), "LinAlgError: Singular matrix"),
     ],

@@ -149,6 +149,7 @@ class LeftRightFiles:
         return len(self._paths)
 
     def pair(self, index: int) -> Pair:
+        """Return the left and right image of one stereo frame; raises InputError when it cannot be read."""
         left_path, right_path = self._paths[index]
         left, right = read_image(left_path), read_image(right_path)
         if left.shape != right.shape:
@@ -168,6 +169,7 @@ class SideBySideFiles:
         return len(self._paths)
 
     def pair(self, index: int) -> Pair:
+        """Return the left and right image of one stereo frame; raises InputError when it cannot be read."""
         path = self._paths[index]
         return halves(read_image(path), str(path))
 
@@ -187,6 +189,7 @@ class Video:
         return self._length
 
     def pair(self, index: int) -> Pair:
+        """Return the left and right image of one stereo frame; raises InputError when it cannot be read."""
         if index != self._at:
             self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
         good, image = self._capture.read()

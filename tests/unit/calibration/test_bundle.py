@@ -8,7 +8,7 @@ from morpheyes_daemon.calibration.solver import bundle_adjustment as bundle
 from morpheyes_daemon.calibration.solver.cross_validation import geometry_at
 from morpheyes_daemon.calibration.solver.initial_guess import first_guess
 from morpheyes_daemon.calibration.solver.projection import camera_vector, project
-from morpheyes_daemon.calibration.solver.rectification_residuals import infinity_px
+from morpheyes_daemon.calibration.solver.rectification_residuals import StereoGeometry, infinity_px
 from morpheyes_daemon.calibration.solver.solver import calibrate, camera_prior, solve_separately
 from morpheyes_daemon.calibration.solver.uncertainty import baseline_uncertainty
 from tests.support.synthetic_rig import CAM0, CAM1, TEN_M, observations, true_geometry, true_pose
@@ -105,5 +105,5 @@ def test_single_stray_corners_are_set_aside_and_their_pictures_kept() -> None:
     assert not calibration.outliers
 
 
-def _bias_px(solved: object, nominal_m: float) -> float:
+def _bias_px(solved: StereoGeometry, nominal_m: float) -> float:
     return float(np.mean(infinity_px(solved, true_geometry(nominal_m))))

@@ -153,6 +153,8 @@ def test_the_same_seed_renders_the_same_pictures(boards: Path, tmp_path: Path) -
         assert picture.std() > 20
     render_folder(tmp_path / "third", 0, (0.2,), views=2)
     one, two = (cv2.imread(str(tmp_path / name / "200mm" / "left01.png")) for name in ("again", "third"))
+    assert one is not None
+    assert two is not None
     assert np.array_equal(one, two)
 
 

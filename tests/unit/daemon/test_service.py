@@ -1,6 +1,7 @@
 """What systemd hears, and what it takes for the watchdog to stop."""
 
 import math
+from typing import Any
 
 import pytest
 
@@ -50,7 +51,7 @@ def test_ready_once_status_at_every_change_watchdog_always() -> None:
         ({"perception": 31.0}, False),
     ],
 )
-def test_only_what_a_restart_could_mend_stops_the_watchdog(ages_s: dict[str, float], turns: bool) -> None:
+def test_only_what_a_restart_could_mend_stops_the_watchdog(ages_s: dict[str, Any], turns: bool) -> None:
     assert chain_turns(report(**ages_s)) is turns
     manager = Manager()
     SystemdReport(manager.send).tell(report(**ages_s))

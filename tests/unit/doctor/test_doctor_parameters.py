@@ -16,7 +16,7 @@ def config(**autopilot: object) -> VehicleConfig:
     return VehicleConfig(
         camera=SimCameraConfig(),
         servo=NoServoConfig(backend="none"),
-        autopilot=AutopilotConfig(**autopilot),  # type: ignore[arg-type]
+        autopilot=AutopilotConfig(**autopilot),
     )
 
 

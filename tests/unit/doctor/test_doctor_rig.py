@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections import namedtuple
 from dataclasses import replace
 from pathlib import Path
@@ -65,7 +67,7 @@ def view(seq: int) -> tuple[Image, Image]:
     """A textured wall at DISPARITY_PX, with the noise that two exposures never share."""
     noise = np.random.default_rng(seq)
     wall = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH + 40), np.uint8), (0, 0), 1.2)
-    wall = cv2.normalize(wall, None, 20, 230, cv2.NORM_MINMAX)
+    wall = cv2.normalize(wall, np.empty_like(wall), 20, 230, cv2.NORM_MINMAX)
     left, right = wall[:, :WIDTH], wall[:, DISPARITY_PX : DISPARITY_PX + WIDTH]
     pair = (eye.astype(int) + noise.integers(-2, 3, eye.shape) for eye in (left, right))
     first, second = (np.clip(eye, 0, 255).astype(np.uint8) for eye in pair)
@@ -249,12 +251,12 @@ def test_power_of_a_raspberry_pi(tmp_path: Path, bits: str, severity: str | None
 
 def test_disk_clock_and_permissions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(machine.shutil, "disk_usage", lambda path: usage(10**9, 10**9, 5 * 10**7))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9, 5 * 10**7))
     monkeypatch.setattr(machine, "wall_time_s", lambda: 86_400.0)
     port = tmp_path / "port"
     port.write_text("")
     closed = {port, tmp_path}
-    monkeypatch.setattr(machine.os, "access", lambda path, mode: path not in closed)
+    monkeypatch.setattr(os, "access", lambda path, mode: path not in closed)
     servo = SerialServoConfig(backend="serial", url=f"serial:{port}:115200")
     found = ids(examine_machine(config(tmp_path, servo=servo), tmp_path / "no-sysfs"))
     assert found == ["log-folder-closed", "clock-not-set", "no-permission"]

@@ -117,7 +117,7 @@ def config(**changes: object) -> VehicleConfig:
         camera=SimCameraConfig(rate_hz=8.0, mount=Mount(forward_mm=80, right_mm=10, down_mm=-30, tilt_up_deg=10)),
         servo=NoServoConfig(backend="none", baseline_mm=150),
         safety=SafetyConfig(depth_sigmas=2.5, max_relative_depth_error=0.15),
-        footprint=Footprint(hull_width_mm=400), **changes,  # type: ignore[arg-type]
+        footprint=Footprint(hull_width_mm=400), **changes,
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morpheyes_daemon.messages.core import Pinhole
+from morpheyes_daemon.messages.core import Image, Pinhole
 from morpheyes_daemon.perception.image_checks import (
     FrozenCheck,
     ImageFault,
@@ -22,8 +22,11 @@ PINHOLE = Pinhole(320, 240, 370.0, 159.5, 119.5)
 PANELS = [Panel(5.0, slope_x=0.3), Panel(2.5, x_m=(-0.3, 0.6), y_m=(-0.5, 0.3), seed=3)]
 
 
+Pair = tuple[Image, Image]
+
+
 @pytest.fixture(scope="module")
-def pair():
+def pair() -> Pair:
     left, right, _ = ideal_pair(PANELS, PINHOLE, 0.2, 1.5)
     return left, right
 
@@ -32,7 +35,7 @@ def valid_fraction(left, right):
     return float(np.isfinite(match(left, right, 80).disparity_px).mean())
 
 
-def test_a_good_pair_has_no_fault(pair):
+def test_a_good_pair_has_no_fault(pair: Pair):
     assert exposure_faults(*pair) == set()
     assert matching_faults(*pair, valid_fraction(*pair)) == set()
     # not even when something else says that depth is scarce
@@ -50,7 +53,7 @@ def test_the_same_image_again_is_frozen_in_either_camera(pair):
     assert not check.check(left[:100], right[:100])
 
 
-def test_one_changed_pixel_is_not_frozen(pair):
+def test_one_changed_pixel_is_not_frozen(pair: Pair):
     left, right = pair
     check = FrozenCheck()
     check.check(left, right)
@@ -76,11 +79,11 @@ def test_a_camera_that_sees_nothing_is_told(pair, side, spoil, fault):
     assert exposure_faults(*images) == {fault}
 
 
-def test_dusk_and_bright_sky_are_no_faults(pair):
-    dusk = tuple(image // 8 for image in pair)
-    assert exposure_faults(*dusk) == set()
-    sky = tuple(np.where(np.arange(240)[:, None] < 90, 255, image).astype(np.uint8) for image in pair)
-    assert exposure_faults(*sky) == set()
+def test_dusk_and_bright_sky_are_no_faults(pair: Pair):
+    left, right = (image // 8 for image in pair)
+    assert exposure_faults(left, right) == set()
+    left, right = (np.where(np.arange(240)[:, None] < 90, 255, image).astype(np.uint8) for image in pair)
+    assert exposure_faults(left, right) == set()
 
 
 def test_swapped_cameras_are_told(pair):
@@ -89,14 +92,14 @@ def test_swapped_cameras_are_told(pair):
 
 
 @pytest.mark.parametrize("rows", [-14, 8, 20])
-def test_rows_far_off_are_told(pair, rows):
+def test_rows_far_off_are_told(pair: Pair, rows):
     left, right = pair
     off = np.roll(right, rows, axis=0)
     assert matching_faults(left, off, valid_fraction(left, off)) == {ImageFault.MISALIGNED}
 
 
 @pytest.mark.parametrize("rows", [-7, 0, 5])
-def test_the_row_shift_is_found_in_spite_of_parallax(pair, rows):
+def test_the_row_shift_is_found_in_spite_of_parallax(pair: Pair, rows):
     left, right = pair
     assert abs(row_shift(left, np.roll(right, rows, axis=0)) - rows) <= 1
 
@@ -126,7 +129,8 @@ def ask(check, left, right, disparity_px):
 
 def test_cameras_that_see_the_same_are_alike(pair):
     check = PairCheck()
-    assert [ask(check, *pair, disparity(*pair)) for _ in range(6)] == [set()] * 6
+    left, right = pair
+    assert [ask(check, left, right, disparity(left, right)) for _ in range(6)] == [set()] * 6
 
 
 def test_cameras_that_see_different_things_are_told_after_three_frames(pair):
@@ -138,14 +142,14 @@ def test_cameras_that_see_different_things_are_told_after_three_frames(pair):
     assert ask(check, left, right, disparity(left, right)) == set(), "two good frames clear it"
 
 
-def test_a_row_apart_is_no_fault(pair):
+def test_a_row_apart_is_no_fault(pair: Pair):
     left, right = pair
     apart = np.roll(right, 1, axis=0)
     check = PairCheck()
     assert [ask(check, left, apart, disparity(left, apart)) for _ in range(9)] == [set()] * 9
 
 
-def test_rows_that_stay_apart_are_told_after_five_frames(pair):
+def test_rows_that_stay_apart_are_told_after_five_frames(pair: Pair):
     left, right = pair
     apart, wrong, good = np.roll(right, 2, axis=0), disparity(left, right), (left, right, disparity(left, right))
     check = PairCheck()

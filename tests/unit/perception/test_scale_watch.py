@@ -38,8 +38,8 @@ def sight(
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ R.T
     along = (WALL_M + SLOPE * way_m[0] - way_m[2]) / (rays[..., 2] - SLOPE * rays[..., 0])
     places = way_m + rays * along[..., None]
-    maps = ((places[..., i] * 100.0 + centre).astype(np.float32) for i, centre in ((0, 400.0), (1, 300.0)))
-    image = cv2.remap(TEXTURE, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    map_u, map_v = ((places[..., i] * 100.0 + centre).astype(np.float32) for i, centre in ((0, 400.0), (1, 300.0)))
+    image = cv2.remap(TEXTURE, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     depth = along.astype(np.float32)  # along the optical axis, since a ray's third part is 1 in the camera's own axes
     told = R_from_rotvec(told_turn_rad)
     return ScaleObservation(

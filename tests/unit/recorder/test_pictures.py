@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -47,7 +48,7 @@ def forest_flight(seconds: float = 20.0) -> FlightSeries:
     return series
 
 
-def share_of(picture: np.ndarray, bgr: tuple[int, int, int], tolerance: int = 6) -> float:
+def share_of(picture: Any, bgr: tuple[int, int, int], tolerance: int = 6) -> float:
     return float((np.abs(picture.astype(int) - np.array(bgr)).max(axis=2) <= tolerance).mean())
 
 

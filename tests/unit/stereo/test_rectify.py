@@ -67,7 +67,7 @@ def test_r_rect_is_the_papers():
     assert_allclose(R, np.stack([r_x, np.cross(r_z, r_x), r_z]))
     assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
     assert np.linalg.det(R) == pytest.approx(1.0)
-    assert_allclose(R @ t, [np.linalg.norm(t), 0, 0], atol=1e-15)
+    assert_allclose(R @ t, [float(np.linalg.norm(t)), 0, 0], atol=1e-15)
 
 
 @pytest.mark.parametrize("size", [(640, 480), (320, 240), (642, 483)])

@@ -53,7 +53,7 @@ class Life:
     """A task whose lives are written down: how long each beats, ten times a second, and how it ends."""
 
     def __init__(self, *lives: tuple[float, Exception | None]) -> None:
-        self.lives, self.started_s, self.told = list(lives), [], cast(Told, None)  # type: ignore[var-annotated]
+        self.lives, self.started_s, self.told = list(lives), [], cast(Told, None)
 
     async def run(self, pulse: Pulse) -> None:
         clock = running_clock()
@@ -68,7 +68,7 @@ class Life:
 
 def supervised(life: Life, seconds: float, *, essential: bool = True) -> tuple[Told, list[Event], Task, Supervisor]:
     """Run a supervisor of one task."""
-    told, events = Told(), []  # type: ignore[var-annotated]
+    told, events = Told(), []
     task = Task("camera", life.run, Reason.CAMERA_LOST, essential)
     made: list[Supervisor] = []
 
@@ -168,7 +168,7 @@ def test_one_that_a_flight_does_not_need_is_restarted_and_the_monitor_not_told()
 def test_a_pulse_knows_when_it_last_beat_and_says_the_first_beat_once() -> None:
     async def live() -> None:
         clock = running_clock()
-        pulse, firsts = Pulse(clock), []  # type: ignore[var-annotated]
+        pulse, firsts = Pulse(clock), []
         assert (pulse.count, pulse.last_ns) == (0, 0)
         pulse.on_first = lambda: firsts.append(1)
         for count in (1, 2, 3):

@@ -89,7 +89,7 @@ async def fly(listed: Listed, topics: Topics, last_s: float) -> None:
 def test_it_decides_on_every_percept_right_after_a_stick_message() -> None:
     listed, topics = Listed(), Topics.create()
     sent_ns: set[int] = set()
-    topics.gate.tap(sent_ns.add)
+    topics.gate.tap(sent_ns.add)  # type: ignore[arg-type]
     run_virtual(fly(listed, topics, 1.0))
     assert [seq for _, seq in listed.decided[:20]] == list(range(1, 21))
     assert {t_ns for t_ns, _ in listed.decided} <= sent_ns

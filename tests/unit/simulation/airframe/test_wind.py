@@ -12,7 +12,7 @@ FT_M = 0.3048
 
 def record(conditions: WindConditions, height_m: float, seed: int = 1, steps: int = 40_000) -> list[tuple[float, ...]]:
     wind = Wind(conditions, seed)
-    rows = []
+    rows: list[tuple[float, ...]] = []
     for _ in range(steps):
         wind.advance(0.05, height_m, 0.0)
         rows.append(wind.velocity_ned_m_s)

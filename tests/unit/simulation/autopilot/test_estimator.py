@@ -3,6 +3,7 @@
 import itertools
 import math
 import statistics
+from typing import Any
 
 import pytest
 
@@ -92,7 +93,7 @@ def test_the_same_seed_gives_the_same_errors() -> None:
     ("setup", "told_s", "flags_s", "reported_s"),
     [pytest.param(FLOW_SETUP, 0.5, 0.9, 5.0, id="flow"), pytest.param({}, 0.0, 7.6, 16.8, id="gps")],
 )
-def test_lost_aiding_is_told_in_order(setup: dict[str, float], told_s: float, flags_s: float, reported_s: float) -> None:
+def test_lost_aiding_is_told_in_order(setup: dict[str, Any], told_s: float, flags_s: float, reported_s: float) -> None:
     vehicle, estimator = flying(EstimatorNoise(), **setup)
     advance(vehicle, estimator, 0.1)
     assert estimator.flags & Ekf.POS_HORIZ_REL

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -109,7 +110,7 @@ def test_exposure_follows_the_light_and_the_corners_are_darker(forest: Renderer)
     assert ratio[:6, :6].mean() == pytest.approx(math.sqrt(0.5), abs=0.06)
 
 
-def sensor_fields(sensor: Sensor) -> dict[str, float | bool | int]:
+def sensor_fields(sensor: Sensor) -> dict[str, Any]:
     return {name: getattr(sensor, name) for name in Sensor.__slots__}
 
 

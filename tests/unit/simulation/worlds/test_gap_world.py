@@ -115,7 +115,7 @@ def test_on_the_map_the_wall_is_open_where_the_vehicle_passes(shape: Shape) -> N
 
 @pytest.mark.parametrize("kind", ["periodic", "irregular"])
 def test_a_swaying_wall_keeps_amplitude_and_speed(kind: str) -> None:
-    motion = Motion(kind=kind, sideways_m=0.5, vertical_m=0.2, peak_speed_m_s=0.5, turn_deg=15)  # type: ignore[arg-type]
+    motion = Motion(kind=kind, sideways_m=0.5, vertical_m=0.2, peak_speed_m_s=0.5, turn_deg=15)
     at = swaying(motion, np.array([7.0, 0.3, 0.0]), seed=3)
     t = np.arange(0, 120, 0.02)
     T = np.array([at(float(s)) for s in t])

@@ -34,7 +34,7 @@ class Mission:
     def __init__(
         self, start: VehicleState = STILL, engage_on: ObstacleProfile | None = None, **parameters: object
     ) -> None:
-        self.forest = Forest(ForestParameters(**{"goal": FAR, **parameters}), CRAFT)  # type: ignore[arg-type]
+        self.forest = Forest(ForestParameters(**{"goal": FAR, **parameters}), CRAFT)
         self.t_ns = S
         first = engage_on or profile_at(start)
         self.show(replace(first, t_ns=S), start, engaged=False)
@@ -417,7 +417,7 @@ def test_depth_is_trusted_as_far_as_its_sigmas_allow_and_the_band_is_hull_and_ma
 @pytest.mark.parametrize("changes", [{"tight_margin_m": 0.4}, {"reach_m": 1.05, "safe_m": 0.5}], ids=str)
 def test_parameters_that_contradict_each_other_are_refused(changes: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"tight_margin_m must not|reach_m must be at least 0\.6 m more"):
-        ForestParameters(**changes)  # type: ignore[arg-type]
+        ForestParameters(**changes)
     assert ForestParameters(tight_margin_m=0.3, margin_m=0.3, reach_m=1.1, safe_m=0.5)
 
 

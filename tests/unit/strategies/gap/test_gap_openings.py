@@ -48,7 +48,9 @@ def test_an_oblique_wall_is_measured_along_its_normal():
     T, turn = T_ned_rect(), math.radians(12)
     depth, _ = depth_of_wall([rectangle(0.0, -1.5, 0.6, 0.4)], T, turn_rad=turn)
     found = segment_wall(depth)
+    assert found is not None
     way = crossing_frame(found.plane, depth.pinhole, T)
+    assert way is not None
     assert way.yaw_rad == pytest.approx(turn, abs=0.01)
     (opening,) = find_openings(depth, found, way, VEHICLE)
     assert opening.width_m == pytest.approx(0.6, abs=2 * PX_M)
@@ -106,8 +108,11 @@ def test_a_plain_wall_is_not_bimodal():
     T = T_ned_rect()
     depth, _ = depth_of_wall([], T, turn_rad=0.2)
     found = segment_wall(depth)
+    assert found is not None
     assert not found.bimodal
-    assert find_openings(depth, found, crossing_frame(found.plane, PINHOLE, T), VEHICLE) == ()
+    way = crossing_frame(found.plane, PINHOLE, T)
+    assert way is not None
+    assert find_openings(depth, found, way, VEHICLE) == ()
 
 
 def test_without_depth_there_is_no_wall():

@@ -71,7 +71,9 @@ class Course:
         wanted = self.path.wanted_velocity(command, self.vehicle, now_ns) if flies else (0.0, 0.0, 0.0)
         v = [u + 0.02 / LEAN_LAG_S * (w - u) for u, w in zip(self.vehicle.v_ned_m_s, wanted, strict=True)]
         north, east, down = (p + 0.02 * u for p, u in zip(self.vehicle.p_ned_m, v, strict=True))
-        self.vehicle = replace(self.vehicle, p_ned_m=(north, east, down), v_ned_m_s=tuple(float(u) for u in v))
+        self.vehicle = replace(
+            self.vehicle, p_ned_m=(north, east, down), v_ned_m_s=(float(v[0]), float(v[1]), float(v[2]))
+        )
 
     def fly(self, seconds):
         for _ in range(round(5 * seconds)):

@@ -81,7 +81,7 @@ def with_depth(seen: View, columns: slice, rows: slice = slice(None), **changes:
     for name, value in changes.items():
         maps[name] = getattr(seen.depth, name).copy()
         maps[name][rows, columns] = value
-    return replace(seen, depth=replace(seen.depth, **maps))  # type: ignore[arg-type]
+    return replace(seen, depth=replace(seen.depth, **maps))
 
 
 def at(found: ObstacleProfile, heading_rad: float) -> int:
