@@ -34,6 +34,8 @@ from morpheyes_daemon.wire.mavlink import (
     Message,
     Signing,
     dialect,
+    frame_number,
+    frame_source,
     source,
     text_of,
 )
@@ -48,6 +50,10 @@ REOPEN_S = 5.0
 BACK_OFF_S = (0.2, 5.0)
 STREAM_GONE_NS = 2 * S
 AUTOPILOT_COMPONENT = 1
+READ_NS = 2 * MS
+"""How long one turn of the event loop may handle what the link brought."""
+GARBAGE_BYTES = 2000
+"""Bytes that belong to no frame are skipped in pieces of this size, with a look at the clock between them."""
 
 
 class AutopilotConnection:
@@ -88,6 +94,9 @@ class AutopilotConnection:
         self._want_parameters = True
         self._greeted_ns = 0
         self._timesync_ns = 0
+        self._reading_on = False
+        self._rebooted_ns: int | None = None
+        self._reboots = 0
         self.refused_streams: list[str] = []
 
     # -- what others hear ---------------------------------------------------------------------------------------
@@ -174,15 +183,40 @@ class AutopilotConnection:
     # -- reception ----------------------------------------------------------------------------------------------
 
     def _on_bytes(self, data: bytes) -> None:
-        now_ns = self._clock.now_ns()
-        for message in self._decoder.feed(data):
-            sender = source(message)
-            if sender == self._vehicle:
+        self._decoder.add(data)
+        self._read()
+
+    def _read(self) -> None:
+        """Handle what has been received for READ_NS at most; the rest waits for the loop's next turn."""
+        started_ns = now_ns = self._clock.now_ns()
+        while (frame := self._decoder.next_frame(GARBAGE_BYTES)) is not None or self._decoder.pending:
+            if frame is not None:
+                self._take_frame(frame, started_ns)
+            now_ns = self._clock.now_ns()
+            if now_ns - started_ns > READ_NS and self._decoder.pending:
+                self._read_on()
+                return
+
+    def _read_on(self) -> None:
+        if not self._reading_on:
+            self._reading_on = True
+            asyncio.get_running_loop().call_soon(self._continue_reading)
+
+    def _continue_reading(self) -> None:
+        self._reading_on = False
+        self._read()
+
+    def _take_frame(self, frame: bytes, now_ns: int) -> None:
+        """Only what the vehicle sends, and the ground station's heartbeat, is worth decoding."""
+        sender = frame_source(frame)
+        if sender == self._vehicle:
+            message = self._decoder.decode(frame)
+            if message is not None:
                 self._take(message, now_ns)
-            elif sender == self._gcs and message.get_type() == "HEARTBEAT":
-                self._publish(self._telemetry.take_gcs(now_ns))
-            for pass_on in self._on_frame:
-                pass_on(bytes(message.get_msgbuf()))
+        elif sender == self._gcs and frame_number(frame) == dialect.MAVLINK_MSG_ID_HEARTBEAT:
+            self._publish(self._telemetry.take_gcs(now_ns))
+        for pass_on in self._on_frame:
+            pass_on(frame)
 
     def _take(self, message: Message, now_ns: int) -> None:
         self._heard_ns = now_ns
@@ -207,14 +241,23 @@ class AutopilotConnection:
         boot_ms = getattr(message, "time_boot_ms", None)
         if boot_ms is not None and self._telemetry.boot.rebooted(boot_ms):
             self._telemetry.boot.reset()
-            self._event(Reason.AUTOPILOT_REBOOTED, f"it has been up for {boot_ms / 1000:.1f} s")
-            self._ask_all()
+            self._report_reboot(boot_ms, now_ns)
         state = self._telemetry.take(message, now_ns)
         if state is None:
             return
         if message.get_type() == "RC_CHANNELS":
             self._echo.seen(state.rc_us, now_ns)
         self._publish(state)
+
+    def _report_reboot(self, boot_ms: int, now_ns: int) -> None:
+        """Say so once a second at most: a boot time that goes to and fro says nothing new each time."""
+        self._reboots += 1
+        if self._rebooted_ns is not None and now_ns - self._rebooted_ns < ONCE_A_SECOND_NS:
+            return
+        more = f" ({self._reboots - 1} more since the last report)" if self._reboots > 1 else ""
+        self._rebooted_ns, self._reboots = now_ns, 0
+        self._event(Reason.AUTOPILOT_REBOOTED, f"it has been up for {boot_ms / 1000:.1f} s{more}")
+        self._ask_all()
 
     def _take_timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 != 0 and message.ts1 == self._timesync_ns:
@@ -283,6 +326,7 @@ class AutopilotConnection:
                 self._hello(now_ns)
                 self._check_streams(now_ns, opened_ns)
             self._check_echo(now_ns)
+            self.parameters.tell_due(now_ns)
 
     def _hello(self, now_ns: int) -> None:
         self._timesync_ns = now_ns
