@@ -12,7 +12,6 @@ import hashlib
 import hmac
 import os
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +32,8 @@ __all__ = [
     "Message",
     "Signing",
     "dialect",
+    "frame_number",
+    "frame_source",
     "override_message",
     "source",
     "text_of",
@@ -43,14 +44,17 @@ Message = Any
 
 LEAVE = 65535
 """RC_CHANNELS_OVERRIDE: the autopilot keeps what it has on this channel (1 to 8)."""
+BACKLOG_BYTES = 256 * 1024
+"""Received bytes that a decoder keeps unread; 2.8 s of a serial line at 921600 baud."""
 SIGNING_EPOCH_S = 1_420_070_400
 """Signature stamps count 10 us since 2015-01-01 UTC."""
 
-_V2 = 0xFD
+_V1, _V2 = 0xFE, 0xFD
 _SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
 _ONE_MINUTE = 6_000_000
-_MARKER = re.compile(rb"[\xfd\xfe]")
+_MARKER = re.compile(rb"\xfe|\xfd.[\x00\x01]", re.DOTALL)
+"""What a frame can start with; a version 2 frame has a length and then flags of which only the signature's is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,52 +150,115 @@ class Signing:
 class Decoder:
     """Bytes as they arrive to messages; whatever is not a whole valid frame is counted in `bad_bytes` and skipped.
 
-    After a frame that fails its checksum the search goes on one byte later, so no good frame behind it is lost.
-    With `signing`, unsigned and wrongly signed frames are counted in `rejected` and dropped.
+    `add` takes bytes, `next_frame` finds the frames in them one by one, and `decode` makes a message of one; a
+    frame whose message nobody wants costs its checksum alone. `feed` does all three. After a frame that fails its
+    checksum the search goes on one byte later, so no good frame behind it is lost. With `signing`, unsigned and
+    wrongly signed frames are counted in `rejected` and dropped; `signed` counts those that carry a signature.
     """
 
     def __init__(self, signing: Signing | None = None) -> None:
         self._mav = dialect.MAVLink(None)
         self._signing = signing
         self._buffer = bytearray()
+        self._at = 0
+        self._waits = True
         self.bad_bytes = 0
         self.rejected = 0
+        self.signed = 0
 
     def feed(self, data: bytes) -> list[Message]:
         """Add received bytes and return the messages that are now complete; never raises on any input."""
-        self._buffer += data
-        return list(self._messages())
+        self.add(data)
+        messages = []
+        while (frame := self.next_frame()) is not None:
+            message = self.decode(frame)
+            if message is not None:
+                messages.append(message)
+        return messages
 
-    def _messages(self) -> Iterator[Message]:
-        buffer = self._buffer
-        at = 0
-        while (start := _MARKER.search(buffer, at)) is not None:
-            self.bad_bytes += start.start() - at
-            at = start.start()
+    def add(self, data: bytes) -> None:
+        """Take received bytes; what is kept unread beyond BACKLOG_BYTES is dropped, the oldest first."""
+        del self._buffer[: self._at]
+        self._at = 0
+        self._buffer += data
+        self._waits = False
+        excess = len(self._buffer) - BACKLOG_BYTES
+        if excess > 0:
+            self.bad_bytes += excess
+            del self._buffer[:excess]
+
+    @property
+    def pending(self) -> bool:
+        """True while `next_frame` may find another frame, or more garbage, in what has been received."""
+        return not self._waits
+
+    def next_frame(self, most_bad_bytes: int = BACKLOG_BYTES) -> bytes | None:
+        """Return the next whole valid frame; None when there is none, or after `most_bad_bytes` of garbage."""
+        buffer, limit = self._buffer, self.bad_bytes + most_bad_bytes
+        while self.bad_bytes < limit:
+            start = _MARKER.search(buffer, self._at)
+            if start is None:
+                self._skip_garbage()
+                return None
+            self.bad_bytes += start.start() - self._at
+            at = self._at = start.start()
             length = _frame_length(buffer, at)
             if length is None or at + length > len(buffer):
-                break
+                self._waits = True
+                return None
             frame = bytes(buffer[at : at + length])
-            message = self._decoded(frame) if length else None
-            if message is None:
+            if not length or not _checksum_fits(frame):
                 self.bad_bytes += 1
-                at += 1
+                self._at += 1
                 continue
-            at += length
-            if self._signing is None or self._signing.accept(frame):
-                yield message
-            else:
-                self.rejected += 1
-        else:
-            self.bad_bytes += len(buffer) - at
-            at = len(buffer)
-        del buffer[:at]
+            self._at += length
+            if self._admits(frame):
+                return frame
+        return None
 
-    def _decoded(self, frame: bytes) -> Message | None:
+    def decode(self, frame: bytes) -> Message | None:
+        """Return the message of a frame of `next_frame`, None when its payload cannot be read."""
         try:
             return self._mav.decode(bytearray(frame))
         except dialect.MAVError:
+            self.bad_bytes += len(frame)
             return None
+
+    def _skip_garbage(self) -> None:
+        """No frame starts in the rest, unless its last bytes are the first ones of a header."""
+        keep = len(self._buffer)
+        for at in range(max(self._at, keep - 2), keep):
+            if self._buffer[at] in (_V1, _V2):
+                keep = at
+                break
+        self.bad_bytes += keep - self._at
+        self._at = keep
+        self._waits = True
+
+    def _admits(self, frame: bytes) -> bool:
+        if frame[0] == _V2 and frame[2] & _SIGNED:
+            self.signed += 1
+        if self._signing is None or self._signing.accept(frame):
+            return True
+        self.rejected += 1
+        return False
+
+
+def frame_source(frame: bytes) -> Identity:
+    """Return who sent a frame of `Decoder.next_frame`."""
+    return Identity(frame[5], frame[6]) if frame[0] == _V2 else Identity(frame[3], frame[4])
+
+
+def frame_number(frame: bytes) -> int:
+    """Return the message id of a frame of `Decoder.next_frame`."""
+    return frame[7] | frame[8] << 8 | frame[9] << 16 if frame[0] == _V2 else frame[5]
+
+
+def _checksum_fits(frame: bytes) -> bool:
+    end = len(frame) - (_SIGNATURE_LENGTH if frame[0] == _V2 and frame[2] & _SIGNED else 0)
+    crc = dialect.x25crc(frame[1 : end - 2])
+    crc.accumulate(bytes((dialect.mavlink_map[frame_number(frame)].crc_extra,)))
+    return bool(crc.crc == frame[end - 2] | frame[end - 1] << 8)
 
 
 def _frame_length(buffer: bytearray, at: int) -> int | None:

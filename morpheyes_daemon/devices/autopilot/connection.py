@@ -35,6 +35,8 @@ from morpheyes_daemon.wire.mavlink import (
     Message,
     Signing,
     dialect,
+    frame_number,
+    frame_source,
     source,
     text_of,
 )
@@ -49,6 +51,8 @@ REOPEN_S = 5.0
 BACK_OFF_S = (0.2, 5.0)
 STREAM_GONE_NS = 2 * S
 AUTOPILOT_COMPONENT = 1
+GARBAGE_BYTES = 2000
+"""Bytes that belong to no frame are skipped in pieces of this size."""
 
 
 class AutopilotConnection:
@@ -89,6 +93,8 @@ class AutopilotConnection:
         self._want_parameters = True
         self._greeted_ns = 0
         self._timesync_ns = 0
+        self._rebooted_ns: int | None = None
+        self._reboots = 0
         self.refused_streams: list[str] = []
         self.on_error: OnError = raise_it
 
@@ -182,14 +188,22 @@ class AutopilotConnection:
 
     def _on_bytes(self, data: bytes) -> None:
         now_ns = self._clock.now_ns()
-        for message in self._decoder.feed(data):
-            sender = source(message)
-            if sender == self._vehicle:
+        self._decoder.add(data)
+        while (frame := self._decoder.next_frame(GARBAGE_BYTES)) is not None or self._decoder.pending:
+            if frame is not None:
+                self._take_frame(frame, now_ns)
+
+    def _take_frame(self, frame: bytes, now_ns: int) -> None:
+        """Only what the vehicle sends, and the ground station's heartbeat, is worth decoding."""
+        sender = frame_source(frame)
+        if sender == self._vehicle:
+            message = self._decoder.decode(frame)
+            if message is not None:
                 call_each([lambda heard: self._take(heard, now_ns)], message, self.on_error)
-            elif sender == self._gcs and message.get_type() == "HEARTBEAT":
-                self._publish(self._telemetry.take_gcs(now_ns))
-            for pass_on in self._on_frame:
-                pass_on(bytes(message.get_msgbuf()))
+        elif sender == self._gcs and frame_number(frame) == dialect.MAVLINK_MSG_ID_HEARTBEAT:
+            self._publish(self._telemetry.take_gcs(now_ns))
+        for pass_on in self._on_frame:
+            pass_on(frame)
 
     def _take(self, message: Message, now_ns: int) -> None:
         self._heard_ns = now_ns
@@ -214,14 +228,23 @@ class AutopilotConnection:
         boot_ms = getattr(message, "time_boot_ms", None)
         if boot_ms is not None and self._telemetry.boot.rebooted(boot_ms):
             self._telemetry.boot.reset()
-            self._event(Reason.AUTOPILOT_REBOOTED, f"it has been up for {boot_ms / 1000:.1f} s")
-            self._ask_all()
+            self._report_reboot(boot_ms, now_ns)
         state = self._telemetry.take(message, now_ns)
         if state is None:
             return
         if message.get_type() == "RC_CHANNELS":
             self._echo.seen(state.rc_us, now_ns)
         self._publish(state)
+
+    def _report_reboot(self, boot_ms: int, now_ns: int) -> None:
+        """Say so once a second at most: a boot time that goes to and fro says nothing new each time."""
+        self._reboots += 1
+        if self._rebooted_ns is not None and now_ns - self._rebooted_ns < ONCE_A_SECOND_NS:
+            return
+        more = f" ({self._reboots - 1} more since the last report)" if self._reboots > 1 else ""
+        self._rebooted_ns, self._reboots = now_ns, 0
+        self._event(Reason.AUTOPILOT_REBOOTED, f"it has been up for {boot_ms / 1000:.1f} s{more}")
+        self._ask_all()
 
     def _take_timesync(self, message: Message, now_ns: int) -> None:
         if message.tc1 != 0 and message.ts1 == self._timesync_ns:
@@ -299,6 +322,7 @@ class AutopilotConnection:
                 self._hello(now_ns)
                 self._check_streams(now_ns, opened_ns)
             self._check_echo(now_ns)
+            self.parameters.tell_due(now_ns)
 
     def _hello(self, now_ns: int) -> None:
         self._timesync_ns = now_ns

@@ -21,6 +21,7 @@ ASK_AGAIN = 40
 """Missing values asked for at a time; the autopilot's queue for them is short."""
 PATIENCE_NS = 6 * S
 """Reading gives up when nothing at all has come for this long."""
+TELL_NS = 1 * S
 SET_TRIES = 4
 SET_WAIT_S = 0.6
 
@@ -40,6 +41,8 @@ class ParameterClient:
         self._last_ns = 0
         self._changed = asyncio.Event()
         self._listeners: list[Callable[[Mapping[str, float]], None]] = []
+        self._untold = False
+        self._told_ns = -TELL_NS
         self.complete = False
 
     @property
@@ -48,7 +51,7 @@ class ParameterClient:
         return MappingProxyType(self._values)
 
     def on_change(self, listener: Callable[[Mapping[str, float]], None]) -> None:
-        """Call `listener` with all values when reading is done, and at every later change."""
+        """Call `listener` with all values when reading is done, and after later changes, once a second at most."""
         self._listeners.append(listener)
 
     def take(self, message: Message) -> None:
@@ -65,6 +68,12 @@ class ParameterClient:
             self._count = message.param_count
         self._changed.set()
         if is_new and self.complete:
+            self._untold = True
+            self.tell_due(self._last_ns)
+
+    def tell_due(self, now_ns: int) -> None:
+        """Tell the listeners of changes, once in TELL_NS at most: what they make of them is dear."""
+        if self._untold and now_ns - self._told_ns >= TELL_NS:
             self._tell()
 
     async def read_all(self) -> None:
@@ -84,6 +93,7 @@ class ParameterClient:
                 self._ask_again()
         self.complete = True
         self._tell()
+        self._told_ns = -TELL_NS  # the first change after a reading is told at once
 
     def _ask_again(self) -> None:
         if self._count is None:
@@ -122,6 +132,7 @@ class ParameterClient:
         return True
 
     def _tell(self) -> None:
+        self._untold, self._told_ns = False, self._clock.now_ns()
         for listener in self._listeners:
             listener(self.values)
 

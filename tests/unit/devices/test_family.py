@@ -66,7 +66,7 @@ def test_the_configuration_lists_the_same_backends_as_the_tables() -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_a_camera_of_another_package_gets_its_checked_options() -> None:
-    config: Any = TypeAdapter(CameraConfig).validate_python({"backend": "webcam", "options": {"serial": "7"}})
+    config: Any = TypeAdapter(CameraConfig).validate_python({"backend": "webcam", "options": {"serial": 7}})
     camera: Any = build_camera(config, DeviceContext.alone(HandClock()))
     assert isinstance(camera, Webcam)
     assert camera.config.options.serial == 7
