@@ -139,7 +139,7 @@ class ProcessWorker(Generic[Job, Result]):
             raise WorkerLost("The vision worker took too long to start and was killed.") from None
         else:
             self._child = child
-            child.on_exit(lambda: self._mourn(child))
+            child.on_exit(lambda: self._on_child_exit(child))
             return child
         finally:
             if self._child is not child:
@@ -152,7 +152,7 @@ class ProcessWorker(Generic[Job, Result]):
             self._on_remark(text)
         self._remarked = text
 
-    def _mourn(self, child: _Child) -> None:
+    def _on_child_exit(self, child: _Child) -> None:
         if self._child is child and not self._turn.locked() and not self._closed:
             self._on_idle_death(f"The vision worker died while idle ({child.cause}); a new one is being started.")
         self._lose(child)

@@ -46,6 +46,7 @@ ROOT = Path(__file__).parents[2]
 UNIT = "morpheyes.service"
 STATE, LOGS, CONFIG = Path("var/lib/morpheyes"), Path("var/log/morpheyes"), Path("etc/morpheyes/config.yaml")
 RELEASE = [0, 0, 0, 0]
+WORKER_NICE = 10
 START_S = 60.0
 pytestmark = [
     pytest.mark.slow,
@@ -225,10 +226,11 @@ class Service:
 
     @property
     def worker(self) -> int:
-        """The vision worker's process as seen from here, 0 while there is none."""
+        """The vision worker's process as seen from here, 0 while there is none; the observer has another nice value."""
         for thread in Path(f"/proc/{self.pid}/task").glob("*/children"):
             for child in thread.read_text().split():
-                if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+                spawned = b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
+                if spawned and os.getpriority(os.PRIO_PROCESS, int(child)) == WORKER_NICE:
                     return int(child)
         return 0
 
