@@ -206,8 +206,7 @@ def shade_image(
     height, width, _ = buffer.shape
     share = np.float32(1.0 / COUNT)
     for row in range(height):
-        known, fresh_until = np.int64(-1), 0
-        footprint = (0.0, 1, 0.0, 0.0)
+        known, fresh_until, footprint = np.int64(-1), 0, (0.0, 1, 0.0, 0.0)
         for column in range(width):
             uniform = _is_uniform(buffer, row, column, record_groups, groups)
             depth[row, column], objects[row, column] = np.inf, -1
@@ -237,6 +236,4 @@ def shade_image(
                 blue, green, red = blue + weight * b, green + weight * g, red + weight * r
                 if uniform:
                     break
-            radiance[row, column, 0] = blue
-            radiance[row, column, 1] = green
-            radiance[row, column, 2] = red
+            radiance[row, column, 0], radiance[row, column, 1], radiance[row, column, 2] = blue, green, red
