@@ -1,7 +1,7 @@
 """What a row of the fault matrix is, how a fault may end, and the rule for each ending. The rows are in `faults`.
 
 Class A: the daemon lives and must act within 250 ms of noticing. Class B: it is dead or cut off, the autopilot's own
-time-out acts, and the vehicle must stop within what the governor had kept free.
+time-out actions, and the vehicle must stop within what the governor had kept free.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from morpheyes_daemon.fault_injection import faults as acts
+from morpheyes_daemon.fault_injection import faults as actions
 from morpheyes_daemon.fault_injection.harness import Measured, Sent
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.safety.states import HOLDING
@@ -30,14 +30,14 @@ STILL_S = 0.1
 """A stream whose last message is older than this has ended."""
 
 
-class Ending(StrEnum):
+class FaultOutcome(StrEnum):
     """How a fault in a state must end; `complaints` checks each."""
 
     FLIES = "flies on"
     FLIES_WITH_PAUSES = "flies on, neutral whenever too much is missing"
     RESUMES = "neutral, then flies on"
-    HOLDS = "neutral until the pilot acts"
-    HOLDS_IF_IT_MATTERS = "flies on, or neutral until the pilot acts"
+    HOLDS = "neutral until the pilot actions"
+    HOLDS_IF_IT_MATTERS = "flies on, or neutral until the pilot actions"
     RELEASES = "released at once"
     LETS_GO = "neutral, then released"
     READY = "stays ready, sends nothing"
@@ -58,9 +58,9 @@ class Fault:
     name: str
     what: str
     notice_s: float
-    endings: Mapping[State, Ending]
-    begin: acts.Act = lambda flight: None
-    end: acts.Act = lambda flight: None
+    endings: Mapping[State, FaultOutcome]
+    begin: actions.Act = lambda flight: None
+    end: actions.Act = lambda flight: None
     lasts_s: float | None = None
     watch_s: float = 7.0
     settles: bool = True
@@ -77,10 +77,10 @@ class Fault:
     @property
     def kind(self) -> str:
         """A: the daemon lives. B: it is dead or cut off."""
-        return "B" if Ending.STOPS in self.endings.values() else "A"
+        return "B" if FaultOutcome.STOPS in self.endings.values() else "A"
 
 
-NOT_OURS = (Ending.RELEASES, Ending.READY, Ending.UNREADY)
+NOT_OURS = (FaultOutcome.RELEASES, FaultOutcome.READY, FaultOutcome.UNREADY)
 """The pilot flies, so what is hit is hit by him; that we sent nothing is asked of each."""
 
 
@@ -197,16 +197,16 @@ def _refuses(fault: Fault, state: State, seen: Measured) -> Complaints:
     yield "the daemon started"
 
 
-_RULES: dict[Ending, _Rule] = {
-    Ending.FLIES: _flies,
-    Ending.FLIES_WITH_PAUSES: _flies_with_pauses,
-    Ending.RESUMES: _resumes,
-    Ending.HOLDS: _holds,
-    Ending.HOLDS_IF_IT_MATTERS: _holds_if_it_matters,
-    Ending.RELEASES: _releases,
-    Ending.LETS_GO: _lets_go,
-    Ending.READY: _ready,
-    Ending.UNREADY: _unready,
-    Ending.STOPS: _stops,
-    Ending.REFUSES: _refuses,
+_RULES: dict[FaultOutcome, _Rule] = {
+    FaultOutcome.FLIES: _flies,
+    FaultOutcome.FLIES_WITH_PAUSES: _flies_with_pauses,
+    FaultOutcome.RESUMES: _resumes,
+    FaultOutcome.HOLDS: _holds,
+    FaultOutcome.HOLDS_IF_IT_MATTERS: _holds_if_it_matters,
+    FaultOutcome.RELEASES: _releases,
+    FaultOutcome.LETS_GO: _lets_go,
+    FaultOutcome.READY: _ready,
+    FaultOutcome.UNREADY: _unready,
+    FaultOutcome.STOPS: _stops,
+    FaultOutcome.REFUSES: _refuses,
 }

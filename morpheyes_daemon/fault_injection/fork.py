@@ -15,7 +15,7 @@ from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
-class Branch:
+class ForkedFlight:
     """A child process on its way."""
 
     pid: int
@@ -29,14 +29,14 @@ class Branch:
         return json.loads(text) if text else None
 
 
-async def branch(story: Callable[[], Awaitable[Any]]) -> Branch:
+async def branch(story: Callable[[], Awaitable[Any]]) -> ForkedFlight:
     """Fork; the parent gets the branch at once, the child lives `story`, reports its JSON value and never returns."""
     loop = asyncio.get_running_loop()
     answer, writer = os.pipe()
     pid = os.fork()
     if pid:
         os.close(writer)
-        return Branch(pid, answer)
+        return ForkedFlight(pid, answer)
     asyncio._set_running_loop(loop)  # asyncio remembers in which process its loop runs
     try:
         with os.fdopen(writer, "w", encoding="utf-8") as file:

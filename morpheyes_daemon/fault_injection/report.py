@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from morpheyes_daemon.fault_injection.expectations import Ending, Fault
+from morpheyes_daemon.fault_injection.expectations import Fault, FaultOutcome
 from morpheyes_daemon.fault_injection.matrix import FAULTS
 from morpheyes_daemon.fault_injection.runner import STATES, Row
 from morpheyes_daemon.messages.safety import State
@@ -57,12 +57,12 @@ def _group(fault: Fault, state: State, rows: list[Row]) -> str:
     if not rows:
         return _line((*named, "", "", "", "", "not flown"))
     ended = ", ".join(dict.fromkeys(f"{row.ended} ({row.reason})" for row in rows if row.ended)) or "not started"
-    released = ending is Ending.RELEASES
+    released = ending is FaultOutcome.RELEASES
     times = [row.release_s if released else row.reaction_s for row in rows]
     known = [time for time in times if time is not None]
-    stops = [row for row in rows if row.stop_m is not None and ending not in (Ending.FLIES, Ending.RESUMES)]
+    stops = [row for row in rows if row.stop_m is not None and ending not in (FaultOutcome.FLIES, FaultOutcome.RESUMES)]
     tightest = max(stops, key=lambda row: (row.stop_m or 0.0) - (row.reserved_m or 0.0), default=None)
-    timed = bool(known) and fault.kind == "A" and ending not in (Ending.FLIES, Ending.HOLDS_IF_IT_MATTERS)
+    timed = bool(known) and fault.kind == "A" and ending not in (FaultOutcome.FLIES, FaultOutcome.HOLDS_IF_IT_MATTERS)
     return _line(
         (
             *named,

@@ -21,8 +21,8 @@ import cv2
 
 from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.errors import CalibrationError, UsageError, mistake
-from morpheyes_daemon.fault_injection.expectations import REACTION_S, RELEASE_S, Ending, Fault, complaints
-from morpheyes_daemon.fault_injection.fork import Branch, branch
+from morpheyes_daemon.fault_injection.expectations import REACTION_S, RELEASE_S, Fault, FaultOutcome, complaints
+from morpheyes_daemon.fault_injection.fork import ForkedFlight, branch
 from morpheyes_daemon.fault_injection.harness import FaultFlight, Measured
 from morpheyes_daemon.fault_injection.matrix import FAULTS
 from morpheyes_daemon.flights.flight_plan import with_seed
@@ -130,14 +130,14 @@ def _fly_seed(plan: FlightPlan, state: State, faults: list[Fault], jobs: int, do
             run_virtual(_fly_state(replace(plan, scenario=scenario, calibration=calibration), state, alike, jobs, done))
         except CalibrationError as error:
             for fault in alike:
-                refused = fault.endings[state] is Ending.REFUSES
+                refused = fault.endings[state] is FaultOutcome.REFUSES
                 done(make_row(fault, state, scenario.seed, None, () if refused else (str(error),)))
 
 
 async def _fly_state(
     plan: FlightPlan, state: State, faults: list[Fault], jobs: int, done: Callable[[Row], None]
 ) -> None:
-    running: deque[tuple[Fault, Branch]] = deque()
+    running: deque[tuple[Fault, ForkedFlight]] = deque()
 
     def collect() -> None:
         fault, child = running.popleft()
@@ -185,7 +185,9 @@ def make_row(fault: Fault, state: State, seed: int, seen: Measured | None, wrong
         state=state,
         seed=seed,
         ending=fault.endings[state],
-        allowed_s=round(fault.notice_s + (RELEASE_S if fault.endings[state] is Ending.RELEASES else REACTION_S), 3),
+        allowed_s=round(
+            fault.notice_s + (RELEASE_S if fault.endings[state] is FaultOutcome.RELEASES else REACTION_S), 3
+        ),
         ended=seen.state if seen else "",
         reason=seen.reason if seen else "",
         reaction_s=_rounded(_reaction_s(fault, state, seen) if seen and in_flight else None),
@@ -199,7 +201,7 @@ def make_row(fault: Fault, state: State, seed: int, seen: Measured | None, wrong
 
 def _reaction_s(fault: Fault, state: State, seen: Measured) -> float | None:
     """When it was neutral for good; where it flies on, when it was neutral first."""
-    return seen.reaction_s if fault.endings[state] is Ending.RESUMES else seen.quiet_s
+    return seen.reaction_s if fault.endings[state] is FaultOutcome.RESUMES else seen.quiet_s
 
 
 def _rounded(value: float | None) -> float | None:

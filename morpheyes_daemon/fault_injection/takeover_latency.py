@@ -19,7 +19,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from morpheyes_daemon.clock import S, run_virtual
-from morpheyes_daemon.fault_injection import faults as acts
+from morpheyes_daemon.fault_injection import faults as actions
 from morpheyes_daemon.fault_injection.fork import branch
 from morpheyes_daemon.fault_injection.harness import FaultFlight, Sent
 from morpheyes_daemon.flights.flight_plan import with_seed
@@ -29,7 +29,10 @@ from morpheyes_daemon.safety.monitor import LOITER
 from morpheyes_daemon.safety.states import HOLDING
 from morpheyes_daemon.simulation.autopilot.flight_modes import Mode
 
-WAYS: dict[str, acts.Act] = {"switch": acts.switch_off, "mode": acts.switch_mode(Mode.ALT_HOLD)}
+WAYS: dict[str, actions.Act] = {
+    "switch": actions.switch_off,
+    "mode": actions.switch_mode(Mode.ALT_HOLD),
+}
 PER_FLIGHT = 200
 BETWEEN_S = (0.0, 0.2)
 WATCHED_S = 1.1

@@ -16,7 +16,7 @@ from morpheyes_daemon.messages.core import VehicleState
 from morpheyes_daemon.recorder.flight_log import flight_header
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import draw_map
-from morpheyes_daemon.recorder.pictures.scene import Disc, Polygon, Scene
+from morpheyes_daemon.recorder.pictures.scene import Disc, ObstacleMap, Polygon
 from morpheyes_daemon.recorder.pictures.strips import draw_strips
 from morpheyes_daemon.recorder.recorder import Recorder
 from morpheyes_daemon.recorder.series import FlightSeries
@@ -28,9 +28,9 @@ from morpheyes_daemon.transforms import inverse
 FILES = ("summary.json", "flight.mcap", "map.png", "strips.png", "flight.mp4")
 
 
-def scene_of(world: World, t_s: float = 0.0) -> Scene:
+def scene_of(world: World, t_s: float = 0.0) -> ObstacleMap:
     """Return what the top view shows of a world at a time of its own."""
-    return Scene(
+    return ObstacleMap(
         discs=tuple(Disc(disc.x_m, disc.y_m, disc.radius_m) for disc in world.discs),
         polygons=tuple(piece for gap in world.gaps for piece in wall_plan(gap, t_s)),
         start_m=world.start_ned_m[:2],
@@ -64,7 +64,7 @@ class FlightArtifacts:
         self._series = FlightSeries()
         self._recorder: Recorder | None = None
         self._film: FlightFilm | None = None
-        self._scene = Scene()
+        self._scene = ObstacleMap()
         self._stage: SimVehicle | None = None
         self._through_s: float | None = None
 

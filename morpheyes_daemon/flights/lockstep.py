@@ -29,7 +29,7 @@ from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.devices.link import Link, LinkOpener, MemoryLink, OnBytes, OnLost
 from morpheyes_daemon.devices.servo import build_servo
 from morpheyes_daemon.errors import DeviceNotFoundError
-from morpheyes_daemon.flights.referee import Outcome, Referee, Reported, Verdict
+from morpheyes_daemon.flights.referee import MonitorView, Outcome, Referee, Verdict
 from morpheyes_daemon.flights.sim_vehicle import Scenario, SimVehicle, SimVehicleCamera
 from morpheyes_daemon.messages.core import Event, StereoFrame
 from morpheyes_daemon.messages.reasons import Reason
@@ -160,7 +160,7 @@ async def _fly(plan: FlightPlan, watchers: Watchers) -> Summary:
         image_rate_hz=watchers.image_rate_hz,
     )
     daemon = Daemon(plan.config, plan.mission, parts, topics, events)
-    tally = Tally(topics, events)
+    tally = FlightCounter(topics, events)
     for attach in watchers.attach:
         attach(daemon, stage)
     judge = Referee(stage, daemon.monitor, topics.gate, plan.limit_s)
@@ -210,7 +210,7 @@ class Crew(Protocol):
 
 async def conduct(
     crew: Crew,
-    monitor: Reported,
+    monitor: MonitorView,
     sleep_until_ns: Callable[[int], Any],
     now_ns: Callable[[], int],
     troubles: Mapping[str, str] | None = None,
@@ -237,7 +237,7 @@ def note_trouble(troubles: dict[str, str], event: Event) -> None:
         troubles.setdefault(event.source, event.text)
 
 
-class Tally:
+class FlightCounter:
     """Counts frames, hashes every stick that went out, and keeps what was last said of each reason."""
 
     def __init__(self, topics: Topics, events: EventLog) -> None:
@@ -276,8 +276,10 @@ class Tally:
         self._hash.update(f"{out.t_ns} {out.action} {out.widths_us}\n".encode())
 
 
-def summarize_flight(plan: FlightPlan, verdict: Verdict, tally: Tally, simulated_s: float, wall_s: float) -> Summary:
-    """Put the judge's verdict and the counts into the row of one flight."""
+def summarize_flight(
+    plan: FlightPlan, verdict: Verdict, tally: FlightCounter, simulated_s: float, wall_s: float
+) -> Summary:
+    """Put the referee's verdict and the counts into the row of one flight."""
     hold_mm = plan.config.hold_baseline_mm
     camera = plan.config.camera
     return Summary(

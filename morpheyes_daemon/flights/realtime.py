@@ -25,7 +25,7 @@ from morpheyes_daemon.daemon.service import build_parts, real_time_runner
 from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.errors import DeviceLostError, DeviceTimeoutError
 from morpheyes_daemon.flights.artifacts import FILES
-from morpheyes_daemon.flights.lockstep import FlightPlan, Progress, Summary, Tally, summarize_flight
+from morpheyes_daemon.flights.lockstep import FlightCounter, FlightPlan, Progress, Summary, summarize_flight
 from morpheyes_daemon.flights.referee import Verdict
 from morpheyes_daemon.flights.simulator_process import End, PilotAct, Ready, SimulatorJob, simulate
 from morpheyes_daemon.flights.stick_timing import StickIntervals, StickTiming
@@ -192,7 +192,7 @@ class RealtimeFlight:
     worker: ProcessWorker[VisionJob, Perception]
     simulator: Simulator
     running: asyncio.Task[None]
-    tally: Tally
+    tally: FlightCounter
     beat: StickTiming
     observer: ObserverTask
 
@@ -240,7 +240,7 @@ async def realtime_daemon(
                 lambda request: daemon.monitor.stop_requested(clock.now_ns()),
             )
             daemon.supervisor.add(Task("observer", observer.run, Reason.TASK_DIED, essential=False))
-            watchers = Tally(topics, events), StickTiming(topics.gate)
+            watchers = FlightCounter(topics, events), StickTiming(topics.gate)
             topics.gate.tap(simulator.tell)
             await observer.start()
             stop = asyncio.Event()

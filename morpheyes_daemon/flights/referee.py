@@ -46,7 +46,7 @@ class Verdict:
     braking_events: int
 
 
-class Reported(Protocol):
+class MonitorView(Protocol):
     """What the daemon says of itself: its monitor, or what was heard of it in another process."""
 
     @property
@@ -65,7 +65,7 @@ class Reported(Protocol):
 class Referee:
     """Watches one flight."""
 
-    def __init__(self, stage: SimVehicle, monitor: Reported, gate: Latest[GateOutput], limit_s: float) -> None:
+    def __init__(self, stage: SimVehicle, monitor: MonitorView, gate: Latest[GateOutput], limit_s: float) -> None:
         self._stage = stage
         self._monitor = monitor
         self._limit_s = limit_s

@@ -82,7 +82,7 @@ class PilotAct(StrEnum):
     LEAVE_LOITER = "change to altitude hold"
 
 
-class Heard:
+class DaemonMirror:
     """What was last heard of the daemon; what the pilot is asked to do goes to `radio`."""
 
     def __init__(self, radio: Radio) -> None:
@@ -154,7 +154,7 @@ class TwinVehicle(SimVehicle):
 
 
 async def _fly(job: SimulatorJob, pipe: Connection, stage: SimVehicle, crew: Crew, url: str) -> None:
-    clock, heard = stage.clock, Heard(stage.radio)
+    clock, heard = stage.clock, DaemonMirror(stage.radio)
     port = PseudoTerminal(stage.teensy.receive)
     stage.teensy.connect(port.write)
     exposures = Exposures(stage)
@@ -175,7 +175,7 @@ async def _fly(job: SimulatorJob, pipe: Connection, stage: SimVehicle, crew: Cre
         stage.close()
 
 
-async def _judge(job: SimulatorJob, pipe: Connection, stage: SimVehicle, crew: Crew, heard: Heard) -> None:
+async def _judge(job: SimulatorJob, pipe: Connection, stage: SimVehicle, crew: Crew, heard: DaemonMirror) -> None:
     """Hand over, and send the verdict when there is one; over when the daemon ends before."""
     judge = Referee(stage, heard, heard.gate, job.limit_s)
     watching = asyncio.create_task(judge.watch())
@@ -213,7 +213,7 @@ class Exposures:
         return await asyncio.to_thread(stage.exposure(self._seq, t_ns))
 
 
-async def _report(stage: SimVehicle, heard: Heard, pipe: Connection, began_ns: int) -> None:
+async def _report(stage: SimVehicle, heard: DaemonMirror, pipe: Connection, began_ns: int) -> None:
     clock: Clock = stage.clock
     while True:
         await stage.vehicle.catch_up()
@@ -227,7 +227,7 @@ async def _report(stage: SimVehicle, heard: Heard, pipe: Connection, began_ns: i
 
 
 @contextlib.contextmanager
-def _hearing(pipe: Connection, heard: Heard) -> Any:
+def _hearing(pipe: Connection, heard: DaemonMirror) -> Any:
     """Hand on what comes through the pipe; a parent that is gone counts as the end."""
     loop = asyncio.get_running_loop()
 

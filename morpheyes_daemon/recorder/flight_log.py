@@ -48,7 +48,7 @@ def flight_header(
 ) -> dict[str, str]:
     """Return the log's header: version, config and mission as JSON, the calibration's hash and the wall time.
 
-    `more` may hold `scene=Scene(...).as_json()` where the surroundings are known, for the map.
+    `more` may hold `scene=ObstacleMap(...).as_json()` where the surroundings are known, for the map.
     """
     return {
         "version": __version__,

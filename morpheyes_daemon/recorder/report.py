@@ -16,7 +16,7 @@ from morpheyes_daemon.config.vehicle import Footprint, VehicleConfig
 from morpheyes_daemon.messages.safety import State
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import draw_map
-from morpheyes_daemon.recorder.pictures.scene import Scene
+from morpheyes_daemon.recorder.pictures.scene import ObstacleMap
 from morpheyes_daemon.recorder.pictures.strips import draw_strips
 from morpheyes_daemon.recorder.reader import Flight
 from morpheyes_daemon.recorder.series import FlightSeries
@@ -86,7 +86,7 @@ def draw_report(flight: Flight, out: Path) -> list[Path]:
     """Write map.png, strips.png and, when the log holds images, flight.mp4 into `out`; returns what was written."""
     out.mkdir(parents=True, exist_ok=True)
     series, header = flight.series(), flight.header
-    scene = Scene.from_json(header["scene"]) if "scene" in header else Scene()
+    scene = ObstacleMap.from_json(header["scene"]) if "scene" in header else ObstacleMap()
     config = header.get("config")
     footprint = VehicleConfig.model_validate_json(config).footprint if config else Footprint()
     title = f"{header.get('mission', '')}  {header.get('wall_time', '')[:16].replace('T', ' ')}".strip()

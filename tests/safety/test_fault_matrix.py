@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from morpheyes_daemon.errors import UsageError
-from morpheyes_daemon.fault_injection.expectations import Ending, Fault, complaints
+from morpheyes_daemon.fault_injection.expectations import Fault, FaultOutcome, complaints
 from morpheyes_daemon.fault_injection.harness import Measured, Sent, TruePath
 from morpheyes_daemon.fault_injection.matrix import FAULTS
 from morpheyes_daemon.fault_injection.report import page
@@ -54,7 +54,7 @@ def test_names_are_unique_and_chosen_by_their_beginning() -> None:
         choose("x")
 
 
-def fault(ending: Ending, state: State = State.ENGAGED, **more: object) -> Fault:
+def fault(ending: FaultOutcome, state: State = State.ENGAGED, **more: object) -> Fault:
     return Fault("name", "what", 0.1, {state: ending}, **more)  # type: ignore[arg-type]
 
 
@@ -67,72 +67,72 @@ HELD = replace(
 )
 RELEASED = replace(HELD, state=State.RELEASED, release_s=0.12, last=Sent.RELEASE)
 SILENT = replace(SEEN, state=State.STANDBY, last=None, last_s=None)
-GOOD: dict[Ending, Measured] = {
-    Ending.FLIES: SEEN,
-    Ending.FLIES_WITH_PAUSES: replace(SEEN, state=State.BRAKING, last=Sent.NEUTRAL, neutrals=40),
-    Ending.RESUMES: replace(SEEN, reaction_s=0.2, neutrals=20, sticks_after=100),
-    Ending.HOLDS: HELD,
-    Ending.HOLDS_IF_IT_MATTERS: HELD,
-    Ending.RELEASES: RELEASED,
-    Ending.LETS_GO: RELEASED,
-    Ending.READY: SILENT,
-    Ending.UNREADY: replace(SILENT, state=State.PREFLIGHT),
-    Ending.STOPS: HELD,
+GOOD: dict[FaultOutcome, Measured] = {
+    FaultOutcome.FLIES: SEEN,
+    FaultOutcome.FLIES_WITH_PAUSES: replace(SEEN, state=State.BRAKING, last=Sent.NEUTRAL, neutrals=40),
+    FaultOutcome.RESUMES: replace(SEEN, reaction_s=0.2, neutrals=20, sticks_after=100),
+    FaultOutcome.HOLDS: HELD,
+    FaultOutcome.HOLDS_IF_IT_MATTERS: HELD,
+    FaultOutcome.RELEASES: RELEASED,
+    FaultOutcome.LETS_GO: RELEASED,
+    FaultOutcome.READY: SILENT,
+    FaultOutcome.UNREADY: replace(SILENT, state=State.PREFLIGHT),
+    FaultOutcome.STOPS: HELD,
 }
-BAD: list[tuple[Ending, dict[str, object]]] = [
-    (Ending.FLIES, {"state": State.HOLD}),
-    (Ending.FLIES, {"last": Sent.NEUTRAL}),
-    (Ending.FLIES, {"left": True}),
-    (Ending.FLIES_WITH_PAUSES, {"state": State.HOLD}),
-    (Ending.FLIES_WITH_PAUSES, {"state": State.RELEASED}),
-    (Ending.RESUMES, {"reaction_s": 0.4}),
-    (Ending.RESUMES, {"reaction_s": None}),
-    (Ending.RESUMES, {"sticks_after": 0}),
-    (Ending.RESUMES, {"state": State.BRAKING}),
-    (Ending.HOLDS, {"quiet_s": 0.36}),
-    (Ending.HOLDS, {"quiet_s": None}),
-    (Ending.HOLDS, {"state": State.BRAKING}),
-    (Ending.HOLDS, {"last": Sent.RELEASE}),
-    (Ending.HOLDS, {"last_s": 6.5}),
-    (Ending.HOLDS, {"stopped": False}),
-    (Ending.HOLDS_IF_IT_MATTERS, {"state": State.RELEASED}),
-    (Ending.RELEASES, {"release_s": 0.16}),
-    (Ending.RELEASES, {"release_s": None}),
-    (Ending.RELEASES, {"state": State.HOLD}),
-    (Ending.RELEASES, {"sticks_after": 1}),
-    (Ending.RELEASES, {"last": Sent.NEUTRAL}),
-    (Ending.LETS_GO, {"quiet_s": 0.4}),
-    (Ending.LETS_GO, {"neutrals": 0}),
-    (Ending.LETS_GO, {"state": State.HOLD}),
-    (Ending.LETS_GO, {"last": Sent.STICKS}),
-    (Ending.READY, {"state": State.PREFLIGHT}),
-    (Ending.READY, {"neutrals": 1}),
-    (Ending.READY, {"last": Sent.STICKS}),
-    (Ending.UNREADY, {"state": State.STANDBY}),
-    (Ending.UNREADY, {"state": State.ENGAGED}),
-    (Ending.UNREADY, {"last": Sent.NEUTRAL}),
-    (Ending.STOPS, {"stopped": False}),
-    (Ending.STOPS, {"stop_m": 4.1}),
-    (Ending.STOPS, {"sticks_after": 1}),
-    (Ending.FLIES, {"clearance_m": -0.01}),
-    (Ending.HOLDS, {"clearance_m": -0.01}),
-    (Ending.LETS_GO, {"clearance_m": -0.01}),
-    (Ending.STOPS, {"clearance_m": -0.01}),
+BAD: list[tuple[FaultOutcome, dict[str, object]]] = [
+    (FaultOutcome.FLIES, {"state": State.HOLD}),
+    (FaultOutcome.FLIES, {"last": Sent.NEUTRAL}),
+    (FaultOutcome.FLIES, {"left": True}),
+    (FaultOutcome.FLIES_WITH_PAUSES, {"state": State.HOLD}),
+    (FaultOutcome.FLIES_WITH_PAUSES, {"state": State.RELEASED}),
+    (FaultOutcome.RESUMES, {"reaction_s": 0.4}),
+    (FaultOutcome.RESUMES, {"reaction_s": None}),
+    (FaultOutcome.RESUMES, {"sticks_after": 0}),
+    (FaultOutcome.RESUMES, {"state": State.BRAKING}),
+    (FaultOutcome.HOLDS, {"quiet_s": 0.36}),
+    (FaultOutcome.HOLDS, {"quiet_s": None}),
+    (FaultOutcome.HOLDS, {"state": State.BRAKING}),
+    (FaultOutcome.HOLDS, {"last": Sent.RELEASE}),
+    (FaultOutcome.HOLDS, {"last_s": 6.5}),
+    (FaultOutcome.HOLDS, {"stopped": False}),
+    (FaultOutcome.HOLDS_IF_IT_MATTERS, {"state": State.RELEASED}),
+    (FaultOutcome.RELEASES, {"release_s": 0.16}),
+    (FaultOutcome.RELEASES, {"release_s": None}),
+    (FaultOutcome.RELEASES, {"state": State.HOLD}),
+    (FaultOutcome.RELEASES, {"sticks_after": 1}),
+    (FaultOutcome.RELEASES, {"last": Sent.NEUTRAL}),
+    (FaultOutcome.LETS_GO, {"quiet_s": 0.4}),
+    (FaultOutcome.LETS_GO, {"neutrals": 0}),
+    (FaultOutcome.LETS_GO, {"state": State.HOLD}),
+    (FaultOutcome.LETS_GO, {"last": Sent.STICKS}),
+    (FaultOutcome.READY, {"state": State.PREFLIGHT}),
+    (FaultOutcome.READY, {"neutrals": 1}),
+    (FaultOutcome.READY, {"last": Sent.STICKS}),
+    (FaultOutcome.UNREADY, {"state": State.STANDBY}),
+    (FaultOutcome.UNREADY, {"state": State.ENGAGED}),
+    (FaultOutcome.UNREADY, {"last": Sent.NEUTRAL}),
+    (FaultOutcome.STOPS, {"stopped": False}),
+    (FaultOutcome.STOPS, {"stop_m": 4.1}),
+    (FaultOutcome.STOPS, {"sticks_after": 1}),
+    (FaultOutcome.FLIES, {"clearance_m": -0.01}),
+    (FaultOutcome.HOLDS, {"clearance_m": -0.01}),
+    (FaultOutcome.LETS_GO, {"clearance_m": -0.01}),
+    (FaultOutcome.STOPS, {"clearance_m": -0.01}),
 ]
 
 
 @pytest.mark.parametrize("ending", GOOD)
-def test_what_ends_as_it_must_is_not_complained_of(ending: Ending) -> None:
+def test_what_ends_as_it_must_is_not_complained_of(ending: FaultOutcome) -> None:
     assert complaints(fault(ending), State.ENGAGED, GOOD[ending]) == []
 
 
 @pytest.mark.parametrize(("ending", "changes"), BAD, ids=str)
-def test_each_rule_notices_what_it_is_for(ending: Ending, changes: dict[str, object]) -> None:
+def test_each_rule_notices_what_it_is_for(ending: FaultOutcome, changes: dict[str, object]) -> None:
     assert complaints(fault(ending), State.ENGAGED, replace(GOOD[ending], **changes))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("ending", [Ending.RELEASES, Ending.LETS_GO, Ending.STOPS])
-def test_out_of_braking_it_may_fly_on_until_it_has_noticed_and_no_longer(ending: Ending) -> None:
+@pytest.mark.parametrize("ending", [FaultOutcome.RELEASES, FaultOutcome.LETS_GO, FaultOutcome.STOPS])
+def test_out_of_braking_it_may_fly_on_until_it_has_noticed_and_no_longer(ending: FaultOutcome) -> None:
     one = fault(ending, State.BRAKING)
     seen = replace(GOOD[ending], sticks_after=5, quiet_s=0.3)
     assert complaints(one, State.BRAKING, seen) == []
@@ -142,13 +142,13 @@ def test_out_of_braking_it_may_fly_on_until_it_has_noticed_and_no_longer(ending:
 
 
 def test_a_daemon_that_starts_where_it_must_refuse_is_complained_of() -> None:
-    assert complaints(fault(Ending.REFUSES), State.ENGAGED, SEEN)
+    assert complaints(fault(FaultOutcome.REFUSES), State.ENGAGED, SEEN)
 
 
 def test_what_falls_or_is_the_pilots_may_hit_the_ground() -> None:
     hit = replace(RELEASED, clearance_m=-0.5)
-    assert complaints(fault(Ending.RELEASES), State.ENGAGED, hit) == []
-    assert complaints(fault(Ending.LETS_GO, falls=True), State.ENGAGED, hit) == []
+    assert complaints(fault(FaultOutcome.RELEASES), State.ENGAGED, hit) == []
+    assert complaints(fault(FaultOutcome.LETS_GO, falls=True), State.ENGAGED, hit) == []
 
 
 def test_rows_are_kept_and_the_page_shows_the_worst(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from morpheyes_daemon.clock import run_virtual
-from morpheyes_daemon.fault_injection import faults as acts
+from morpheyes_daemon.fault_injection import faults as actions
 from morpheyes_daemon.fault_injection.harness import FaultFlight, Sent
 from morpheyes_daemon.flights.flight_plan import make_plan
 from morpheyes_daemon.messages.safety import State
@@ -17,9 +17,9 @@ from morpheyes_daemon.messages.safety import State
 @pytest.mark.parametrize(
     ("lose", "neutral_within_s"),
     # hung: the depth lease of 0.7 s; killed: told at the next frame, 0.3 s; idle: told at once
-    [(acts.hang_worker, 0.72), (acts.kill_worker, 0.32), (acts.kill_idle_worker, 0.02)],
+    [(actions.hang_worker, 0.72), (actions.kill_worker, 0.32), (actions.kill_idle_worker, 0.02)],
 )
-def test_only_the_pilots_flip_flies_on(lose: acts.Act, neutral_within_s: float, tmp_path: Path) -> None:
+def test_only_the_pilots_flip_flies_on(lose: actions.Act, neutral_within_s: float, tmp_path: Path) -> None:
     plan = make_plan("forest", size="160x120", calibration="exact")
 
     async def live() -> None:
@@ -28,7 +28,7 @@ def test_only_the_pilots_flip_flies_on(lose: acts.Act, neutral_within_s: float, 
             lose(flight)
             lost_ns = flight.clock.now_ns()
             await flight.sleep(1.2)
-            acts.mend_worker(flight)  # the new one
+            actions.mend_worker(flight)  # the new one
             await flight.sleep(4.0)
             assert flight.state is State.HOLD
             sticks = [t_ns for t_ns, kind in flight.sent if kind is Sent.STICKS]

@@ -22,14 +22,14 @@ from morpheyes_daemon.messages.core import (
 )
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import Action, GateOutput, State
-from morpheyes_daemon.recorder.pictures.scene import Disc, Scene
+from morpheyes_daemon.recorder.pictures.scene import Disc, ObstacleMap
 from tests.support.hand_clock import HandClock
 
 STICK_HZ = 50
 CAMERA_HZ = 5
 
 
-def forest_scene(seed: int = 0) -> Scene:
+def forest_scene(seed: int = 0) -> ObstacleMap:
     """400 trunks per hectare, none on the made-up path."""
     rng = np.random.default_rng(seed)
     discs = []
@@ -37,7 +37,7 @@ def forest_scene(seed: int = 0) -> Scene:
         x, y, radius = rng.uniform(0, 80), rng.uniform(-14, 14), rng.uniform(0.1, 0.4)
         if abs(y - path_y_m(x)) > radius + 0.5:
             discs.append(Disc(float(x), float(y), float(radius)))
-    return Scene(tuple(discs), start_m=(0.0, 0.0), goal_m=(80.0, 0.0))
+    return ObstacleMap(tuple(discs), start_m=(0.0, 0.0), goal_m=(80.0, 0.0))
 
 
 def path_y_m(x_m: float) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 
 from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.recorder.pictures.outline import Track, boxes, placed
-from morpheyes_daemon.recorder.pictures.scene import Scene
+from morpheyes_daemon.recorder.pictures.scene import ObstacleMap
 from morpheyes_daemon.stereo.colours import baseline_bgr
 
 LEFT_IN, BOTTOM_IN, WIDTH_IN, HEIGHT_IN, APART_IN = 4.3, 0.12, 1.9, 1.48, 0.15
@@ -22,7 +22,7 @@ CIRCLE = {"boxstyle": "circle,pad=0.18", "facecolor": "white", "edgecolor": INK,
 
 
 def draw_closeups(
-    figure: Any, axes: Any, track: Track, scene: Scene, footprint: Footprint, passes: list[tuple[int, float]]
+    figure: Any, axes: Any, track: Track, scene: ObstacleMap, footprint: Footprint, passes: list[tuple[int, float]]
 ) -> None:
     """Draw one panel for each pass (index into the track, clearance in metres), lettered on the map as well."""
     w, h = figure.get_size_inches()
@@ -57,7 +57,7 @@ def _frame(panel: Any, track: Track, i: int) -> None:
     panel.text(x + half - 0.65, y + tall - 0.2, "1 m", ha="center", va="bottom", fontsize=7.5, color=INK, zorder=9)
 
 
-def _draw(panel: Any, track: Track, scene: Scene, footprint: Footprint, i: int) -> None:
+def _draw(panel: Any, track: Track, scene: ObstacleMap, footprint: Footprint, i: int) -> None:
     from matplotlib.patches import Circle, Polygon
 
     for disc in scene.discs:
@@ -81,7 +81,7 @@ def _draw_vehicle(panel: Any, track: Track, j: int, footprint: Footprint, streng
     panel.add_patch(Polygon(placed(bar, at, yaw), facecolor=(r, g, b), edgecolor=INK, **{**strength, "lw": 0.5}))
 
 
-def _letter(axes: Any, track: Track, scene: Scene, i: int, letter: str) -> None:
+def _letter(axes: Any, track: Track, scene: ObstacleMap, i: int, letter: str) -> None:
     """Letter the pass on the map, on the side of the path that is away from the trunk."""
     x, y = track.xy_m[i]
     discs = scene.disc_array()

@@ -19,7 +19,7 @@ from morpheyes_daemon.clock import S
 from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.messages.core import BaselineEstimate, DepthSummary, Governed, Image, Perception, VehicleState
 from morpheyes_daemon.recorder.channels import DEPTH_IMAGE, LEFT_IMAGE
-from morpheyes_daemon.recorder.pictures.scene import Scene
+from morpheyes_daemon.recorder.pictures.scene import ObstacleMap
 from morpheyes_daemon.recorder.pictures.topview import Pose, TopView
 from morpheyes_daemon.recorder.pictures.video import VideoWriter
 from morpheyes_daemon.recorder.reader import Flight
@@ -46,7 +46,7 @@ class Newest:
 class FlightFilm:
     """Makes flight.mp4 as the flight goes on."""
 
-    def __init__(self, path: Path, scene: Scene, footprint: Footprint) -> None:
+    def __init__(self, path: Path, scene: ObstacleMap, footprint: Footprint) -> None:
         self._video = VideoWriter(path)
         self._topview = TopView(scene, footprint, (PANEL_W, PANEL_H))
         self._newest = Newest()
@@ -59,7 +59,7 @@ class FlightFilm:
             getattr(topics, name).tap(lambda value, name=name: self.add(name, value))
 
     @classmethod
-    def of_log(cls, path: Path, flight: Flight, scene: Scene, footprint: Footprint) -> int:
+    def of_log(cls, path: Path, flight: Flight, scene: ObstacleMap, footprint: Footprint) -> int:
         """Make the film of a recorded flight from the pictures in its log; returns their number."""
         film, left, count = cls(path, scene, footprint), None, 0
         for record in flight.records:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.recorder.pictures.closeups import draw_closeups
 from morpheyes_daemon.recorder.pictures.outline import Track, clearances, closest_passes
-from morpheyes_daemon.recorder.pictures.scene import Scene
+from morpheyes_daemon.recorder.pictures.scene import ObstacleMap
 from morpheyes_daemon.recorder.series import FlightSeries
 from morpheyes_daemon.stereo.colours import MAX_BASELINE_M, MIN_BASELINE_M
 
@@ -32,7 +32,7 @@ RED = "#b3123a"
 
 
 def draw_map(
-    out: Path, series: FlightSeries, scene: Scene, footprint: Footprint, *, title: str = "", collided: bool = False
+    out: Path, series: FlightSeries, scene: ObstacleMap, footprint: Footprint, *, title: str = "", collided: bool = False
 ) -> None:
     """Write the map of `series` as a PNG; a flight without any position gives a map of the scene alone."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -63,7 +63,7 @@ def inches(figure: Any, left: float, bottom: float, width: float, height: float)
     return figure.add_axes((left / w, bottom / h, width / w, height / h))
 
 
-def _limits(path: Points, scene: Scene) -> Limits:
+def _limits(path: Points, scene: ObstacleMap) -> Limits:
     """North from, to, east from, to: path, start and goal with room around."""
     ends = [p for p in (scene.start_m, scene.goal_m) if p is not None]
     points = np.vstack([path.reshape(-1, 2), np.array(ends).reshape(-1, 2)])
@@ -94,7 +94,7 @@ def quiet(axes: Any) -> None:
         spine.set_linewidth(0.8)
 
 
-def draw_scene(axes: Any, scene: Scene) -> None:
+def draw_scene(axes: Any, scene: ObstacleMap) -> None:
     """Draw trunks and walls to scale."""
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Circle
@@ -135,7 +135,7 @@ def _draw_marks(axes: Any, series: FlightSeries, track: Track, *, collided: bool
         axes.plot(*track.xy_m[-1], "X", zorder=8, label="collided", **style)
 
 
-def _draw_ends(axes: Any, scene: Scene) -> None:
+def _draw_ends(axes: Any, scene: ObstacleMap) -> None:
     style = {"linestyle": "none", "markeredgecolor": "black", "zorder": 6}
     if scene.start_m is not None:
         axes.plot(*scene.start_m, marker="o", color="white", markersize=8, label="start", **style)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from morpheyes_daemon.config.vehicle import Footprint
-from morpheyes_daemon.recorder.pictures.scene import Scene
+from morpheyes_daemon.recorder.pictures.scene import ObstacleMap
 from morpheyes_daemon.recorder.series import FlightSeries
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ def placed(box: Array, xy_m: Array, yaw_rad: float) -> Array:
     return np.asarray(box @ np.array([[c, s], [-s, c]]) + xy_m)
 
 
-def clearances(track: Track, scene: Scene, footprint: Footprint) -> Array:
+def clearances(track: Track, scene: ObstacleMap, footprint: Footprint) -> Array:
     """Return (N,) metres between the vehicle's boxes and the nearest disc, inf without discs."""
     discs = scene.disc_array()
     if len(discs) == 0:

@@ -26,7 +26,7 @@ Polygon = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class ObstacleMap:
     """Obstacles, start and goal (north, east) in metres; each of them may be unknown."""
 
     discs: tuple[Disc, ...] = ()
@@ -43,7 +43,7 @@ class Scene:
         return json.dumps(asdict(self))
 
     @classmethod
-    def from_json(cls, text: str) -> Scene:
+    def from_json(cls, text: str) -> ObstacleMap:
         """Return the scene of `as_json`."""
         plain = json.loads(text)
         start, goal = plain["start_m"], plain["goal_m"]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from morpheyes_daemon.config.vehicle import Footprint
 from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.recorder.pictures.outline import boxes, placed
-from morpheyes_daemon.recorder.pictures.scene import Scene
+from morpheyes_daemon.recorder.pictures.scene import ObstacleMap
 from morpheyes_daemon.stereo.colours import baseline_bgr
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ class TopView:
     """Draws the window around the vehicle; remembers the trail it left."""
 
     def __init__(
-        self, scene: Scene, footprint: Footprint, size: tuple[int, int] = (480, 360), height_m: float = 10.0
+        self, scene: ObstacleMap, footprint: Footprint, size: tuple[int, int] = (480, 360), height_m: float = 10.0
     ) -> None:
         self._scene = scene
         self._footprint = footprint

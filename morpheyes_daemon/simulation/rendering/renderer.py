@@ -19,7 +19,7 @@ from morpheyes_daemon.messages.core import FloatMap, Image, Pinhole
 from morpheyes_daemon.simulation.rendering.raster import COUNT, PLANES, SAMPLES, TILE, rasterise, visible_parts
 from morpheyes_daemon.simulation.rendering.scene import SKY_OBJECT, Material, Mesh, Scene
 from morpheyes_daemon.simulation.rendering.shading import shade_image
-from morpheyes_daemon.simulation.rendering.textures import Atlas, pack
+from morpheyes_daemon.simulation.rendering.textures import TextureAtlas, pack
 from morpheyes_daemon.transforms import Array, inverse, pose
 
 
@@ -106,7 +106,7 @@ class Renderer:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self._atlas: Atlas = pack(scene.textures)
+        self._atlas: TextureAtlas = pack(scene.textures)
         names = {name: i for i, name in enumerate(scene.materials)}
         rows = [self._material_rows(m) for m in scene.materials.values()]
         self._materials = np.array([row for row, _ in rows], np.int64)

@@ -44,7 +44,7 @@ class Texture:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Atlas:
+class TextureAtlas:
     """All textures with their mip levels in one array as the kernels want them.
 
     texels (n,) uint64 hold blue, green, red and the fourth channel in 16-bit lanes, blue lowest; levels
@@ -57,7 +57,7 @@ class Atlas:
     log_sizes: NDArray[np.int64]
 
 
-def pack(textures: Mapping[str, Texture]) -> Atlas:
+def pack(textures: Mapping[str, Texture]) -> TextureAtlas:
     """Lay out the mip levels of all textures."""
     chains = [texture.levels for texture in textures.values()]
     levels = np.zeros((len(chains), max(len(chain) for chain in chains)), np.int64)
@@ -68,7 +68,7 @@ def pack(textures: Mapping[str, Texture]) -> Atlas:
             start += level.size
     flat = np.concatenate([level for chain in chains for level in chain])
     log_sizes = np.array([t.texels.shape[0].bit_length() - 1 for t in textures.values()], np.int64)
-    return Atlas(tuple(textures), flat, levels, log_sizes)
+    return TextureAtlas(tuple(textures), flat, levels, log_sizes)
 
 
 def _blocks(level: Texels) -> NDArray[np.uint64]:

@@ -17,11 +17,11 @@ from pydantic import Field, model_validator
 from morpheyes_daemon.config.vehicle import Section
 from morpheyes_daemon.simulation.rendering import meshes, textures
 from morpheyes_daemon.simulation.rendering.scene import GROUND_OBJECT, Light, Material, Mesh
-from morpheyes_daemon.simulation.worlds.ground import Ground, Relief, lay
+from morpheyes_daemon.simulation.worlds.ground import Ground, GroundShape, lay
 from morpheyes_daemon.simulation.worlds.species import BROADLEAVES, CONIFERS, broadleaf, conifer
 from morpheyes_daemon.simulation.worlds.trees import Tree, tree_meshes
 from morpheyes_daemon.simulation.worlds.undergrowth import Area, Glades, Undergrowth, bushes, with_branches, with_bushes
-from morpheyes_daemon.simulation.worlds.world import START_ROOM_M, Contents
+from morpheyes_daemon.simulation.worlds.world import START_ROOM_M, WorldContents
 from morpheyes_daemon.transforms import Array
 
 LIGHT_MAP_PX = 2048
@@ -62,7 +62,7 @@ class ForestWorld(Section):
     conifers: float = Field(0.4, ge=0, le=1, description="share of trees")
     heading_deg: float = Field(0.0, ge=-180, le=180, description="of the vehicle at the start, from the course")
     undergrowth: Undergrowth = Undergrowth()
-    relief: Relief = Relief()
+    relief: GroundShape = GroundShape()
     rows: tuple[tuple[float, float, float, float], ...] = Field(
         (), description="x, y to x, y: trunks so close that nothing flies through"
     )
@@ -172,7 +172,7 @@ def _leaf_green(rng: np.random.Generator) -> Array:
     return np.asarray(np.array([0.75, 1.0, 0.95]) * rng.uniform(0.7, 1.25, 3) * rng.uniform(0.8, 1.2))
 
 
-def forest_contents(world: ForestWorld, seed: int, light: Light, glades: Glades = ()) -> Contents:
+def forest_contents(world: ForestWorld, seed: int, light: Light, glades: Glades = ()) -> WorldContents:
     """Return trees and ground; no tree stands in a glade."""
     land = lay(world.relief, seed)
     standing = with_branches(plant_rows(world, seed) + plant(world, seed, glades), world.undergrowth, seed)
@@ -182,7 +182,7 @@ def forest_contents(world: ForestWorld, seed: int, light: Light, glades: Glades 
     for i, tree in enumerate(trees):
         parts += tree_meshes(tree, i + 1, light)
     across = (1.0 / _length(world), 1.0 / (2 * world.half_width_m))
-    return Contents(
+    return WorldContents(
         meshes=tuple(parts),
         solids=tuple(solid for tree in trees for solid in tree.solids()),
         discs=tuple(tree.disc_at(MAP_HEIGHT_M) for tree in trees if tree.height_m > MAP_HEIGHT_M),

@@ -16,7 +16,7 @@ from morpheyes_daemon.simulation.worlds.collision import MovingObstacles, Obstac
 from morpheyes_daemon.simulation.worlds.openings import Shape, outline
 from morpheyes_daemon.simulation.worlds.trajectories import Motion, swaying
 from morpheyes_daemon.simulation.worlds.wall_geometry import Wall
-from morpheyes_daemon.simulation.worlds.world import Contents, GapTruth, lit
+from morpheyes_daemon.simulation.worlds.world import GapTruth, WorldContents, lit
 from morpheyes_daemon.transforms import Array, pose
 
 WALL_OBJECT, MURAL_OBJECT = 1, 2
@@ -143,7 +143,7 @@ def gap_truth(world: GapWorld, seed: int) -> GapTruth:
     return GapTruth(outlines, T_ned_wall, world.thickness_mm / 1e3, world.half_width_m)
 
 
-def gap_contents(world: GapWorld, seed: int, light: Light) -> Contents:
+def gap_contents(world: GapWorld, seed: int, light: Light) -> WorldContents:
     """Return wall, mural and ground."""
     truth = gap_truth(world, seed)
     T_ned_wall = truth.T_ned_wall
@@ -157,7 +157,7 @@ def gap_contents(world: GapWorld, seed: int, light: Light) -> Contents:
         lit(wall.faces(), "newsprint", WALL_OBJECT, sun),
         lit(wall.rims(), "newsprint", WALL_OBJECT, sun, dark, two_sided=True),
     )
-    standing = Contents(
+    standing = WorldContents(
         moving=(MovingObject(parts, T_ned_wall, "wall"),),
         obstacles=(MovingObstacles(Obstacles(wall.solids()), T_ned_wall),),
         gaps=(truth,),
@@ -188,16 +188,16 @@ def _place(world: GapWorld, rng: np.random.Generator, seed: int) -> tuple[tuple[
     return tuple(corners - np.array([middle, 0.0]) for corners in placed), middle
 
 
-def _mural(world: GapWorld, light: Light) -> Contents:
+def _mural(world: GapWorld, light: Light) -> WorldContents:
     x, half, top = world.distance_m + world.mural_m, world.half_width_m + world.mural_m, world.top_m + 1.0
     T = pose(np.eye(3), np.array([x, 0.0, -0.5 * top]))
     edges = (0.2, 2 * half, top)
     mesh = lit(meshes.box(T, edges), "mural", MURAL_OBJECT, light.direction)
-    return Contents(meshes=(mesh,), solids=(box_solid(T, edges),))
+    return WorldContents(meshes=(mesh,), solids=(box_solid(T, edges),))
 
 
-def meadow(reach_m: float = 140.0) -> Contents:
+def meadow(reach_m: float = 140.0) -> WorldContents:
     """Return a flat ground of grass."""
     ends = np.array([-reach_m, reach_m])
     vertices, uv, _, triangles = meshes.terrain(ends, ends, np.zeros((2, 2)))
-    return Contents(meshes=(Mesh(vertices, uv, np.ones(len(vertices)), triangles, "meadow", GROUND_OBJECT),))
+    return WorldContents(meshes=(Mesh(vertices, uv, np.ones(len(vertices)), triangles, "meadow", GROUND_OBJECT),))

@@ -17,7 +17,7 @@ from morpheyes_daemon.transforms import Array
 WAVES = 3
 
 
-class Relief(Section):
+class GroundShape(Section):
     """How a world's ground lies; level by default."""
 
     slope_deg: float = Field(0.0, ge=-20, le=20, description="rise along the course")
@@ -66,7 +66,7 @@ class Ground:
 LEVEL = Ground()
 
 
-def lay(relief: Relief, seed: int) -> Ground:
+def lay(relief: GroundShape, seed: int) -> Ground:
     """Return the ground that a relief and a seed make."""
     rise = math.tan(math.radians(relief.slope_deg)), math.tan(math.radians(relief.across_deg))
     if relief.rolling_m == 0.0:

@@ -24,9 +24,9 @@ from morpheyes_daemon.simulation.rendering.scene import SKY_OBJECT, Bgr, Light, 
 from morpheyes_daemon.simulation.worlds.collision import CollisionWorld, VehicleShape
 from morpheyes_daemon.simulation.worlds.forest_world import ForestWorld, forest_contents
 from morpheyes_daemon.simulation.worlds.gap_world import GapWorld, gap_contents
-from morpheyes_daemon.simulation.worlds.ground import LEVEL, Ground, Relief
+from morpheyes_daemon.simulation.worlds.ground import LEVEL, Ground, GroundShape
 from morpheyes_daemon.simulation.worlds.room_world import Cube, RoomWorld, cube_contents, room_contents, room_light
-from morpheyes_daemon.simulation.worlds.world import FLYING_HEIGHT_M, START_ROOM_M, Contents, Disc, GapTruth
+from morpheyes_daemon.simulation.worlds.world import FLYING_HEIGHT_M, START_ROOM_M, Disc, GapTruth, WorldContents
 from morpheyes_daemon.transforms import Array
 
 FOLDER = Path(__file__).parent
@@ -42,7 +42,7 @@ class MixedWorld(Section):
 
     @model_validator(mode="after")
     def _level(self) -> MixedWorld:
-        if self.forest.relief != Relief():
+        if self.forest.relief != GroundShape():
             raise ValueError("the ground of a mixed course must be level, since the wall stands on it")
         return self
 
@@ -159,14 +159,14 @@ def _behind_wall_m(world: GapWorld) -> float:
     return world.distance_m + 0.5 * world.mural_m
 
 
-def _mixed(world: MixedWorld, seed: int, light: Light) -> Contents:
+def _mixed(world: MixedWorld, seed: int, light: Light) -> WorldContents:
     gap = world.gap.model_copy(update={"meadow": False})
     glade = (gap.distance_m + 0.5 * gap.mural_m, 0.0, gap.half_width_m + gap.mural_m + 2.0)
     found = forest_contents(world.forest, seed, light, (glade,)) + gap_contents(gap, seed, light)
     return found if world.cube is None else found + cube_contents(world.cube, light, seed)
 
 
-def _world(contents: Contents, light: Light, goal_m: float | None, with_sky: bool = True) -> World:
+def _world(contents: WorldContents, light: Light, goal_m: float | None, with_sky: bool = True) -> World:
     sky = sky_mesh() if with_sky else None
     shown = [*contents.meshes, *(mesh for body in contents.moving for mesh in body.meshes), *([sky] if sky else [])]
     materials = materials_of(shown, contents.materials)

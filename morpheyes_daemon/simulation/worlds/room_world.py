@@ -15,7 +15,7 @@ from morpheyes_daemon.simulation.rendering import meshes
 from morpheyes_daemon.simulation.rendering.scene import GROUND_OBJECT, Light, MovingObject
 from morpheyes_daemon.simulation.worlds.collision import MovingObstacles, Obstacles, box_solid
 from morpheyes_daemon.simulation.worlds.trajectories import along_waypoints
-from morpheyes_daemon.simulation.worlds.world import FLYING_HEIGHT_M, START_ROOM_M, Contents, lit
+from morpheyes_daemon.simulation.worlds.world import FLYING_HEIGHT_M, START_ROOM_M, WorldContents, lit
 from morpheyes_daemon.transforms import Array, pose
 
 CUBE_OBJECT, ROOM_OBJECT = 1, 2
@@ -129,7 +129,7 @@ def room_light(world: RoomWorld) -> Light:
     return replace(LAMPS, lamps_ned_m=tuple((x_m, 0.0, LAMPS_BELOW_M - world.height_m) for x_m in along_m))
 
 
-def room_contents(world: RoomWorld, light: Light, seed: int = 0) -> Contents:
+def room_contents(world: RoomWorld, light: Light, seed: int = 0) -> WorldContents:
     """Return the room and its cube, whose way depends on the seed if it is scattered."""
     x0, x1 = world.x_range_m
     middle, half, top = 0.5 * (x0 + x1), 0.5 * world.width_m, world.height_m
@@ -145,19 +145,19 @@ def room_contents(world: RoomWorld, light: Light, seed: int = 0) -> Contents:
     found = [(material, pose(np.eye(3), np.array(place)), edges) for material, place, edges in plates]
     floor = meshes.box(pose(np.eye(3), np.array([middle, 0.0, PLATE_M / 2])), (length, width, PLATE_M))
     walls = tuple(lit(meshes.box(T, edges), material, ROOM_OBJECT, light.direction) for material, T, edges in found)
-    room = Contents(
+    room = WorldContents(
         meshes=(*walls, lit(floor, "planks", GROUND_OBJECT, light.direction)),
         solids=tuple(box_solid(T, edges) for _, T, edges in found),
     )
     return room if world.cube is None else room + cube_contents(world.cube, light, seed)
 
 
-def cube_contents(cube: Cube, light: Light, seed: int = 0) -> Contents:
+def cube_contents(cube: Cube, light: Light, seed: int = 0) -> WorldContents:
     """Return the moving cube."""
     edges = (cube.edge_mm / 1e3,) * 3
     T_ned_cube = along_waypoints(_scattered(cube, seed), math.radians(cube.spin_deg_s))
     mesh = lit(meshes.box(np.eye(4), edges), "patchwork", CUBE_OBJECT, light.direction)
-    return Contents(
+    return WorldContents(
         moving=(MovingObject((mesh,), T_ned_cube, "cube"),),
         obstacles=(MovingObstacles(Obstacles([box_solid(np.eye(4), edges)]), T_ned_cube),),
     )

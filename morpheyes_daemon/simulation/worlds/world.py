@@ -1,6 +1,6 @@
 """What a world is made of, piece by piece: things to see with the solids that stand for them in collisions.
 
-Forest, gap and room each give `Contents`; `worlds` adds them up, so a mixed course is a sum.
+Forest, gap and room each give `WorldContents`; `worlds` adds them up, so a mixed course is a sum.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class GapTruth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Contents:
+class WorldContents:
     """Some things of a world; adding two gives both, on the ground of the first."""
 
     meshes: tuple[Mesh, ...] = ()
@@ -61,8 +61,8 @@ class Contents:
     textures: Mapping[str, Texture] = field(default_factory=dict)
     ground: Ground = LEVEL
 
-    def __add__(self, other: Contents) -> Contents:
-        return Contents(
+    def __add__(self, other: WorldContents) -> WorldContents:
+        return WorldContents(
             self.meshes + other.meshes,
             self.solids + other.solids,
             self.moving + other.moving,

@@ -10,7 +10,7 @@ from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.cli import main
 from morpheyes_daemon.config.vehicle import MissionFile, NoServoConfig, SimCameraConfig, VehicleConfig
 from morpheyes_daemon.recorder.flight_log import flight_header
-from morpheyes_daemon.recorder.pictures.scene import Scene
+from morpheyes_daemon.recorder.pictures.scene import ObstacleMap
 from morpheyes_daemon.recorder.recorder import Recorder
 from tests.support.hand_clock import HandClock
 from tests.support.synthetic_flight import SyntheticFlight, forest_scene
@@ -105,6 +105,6 @@ def test_report_makes_figures_and_pictures(log: Path, terminal: Terminal, tmp_pa
 
 def test_a_scene_comes_back_from_a_header() -> None:
     scene = forest_scene()
-    assert Scene.from_json(scene.as_json()) == scene
-    walled = Scene(polygons=(((0.0, 1.0), (2.0, 3.0), (4.0, 5.0)),), goal_m=(1.0, 2.0))
-    assert Scene.from_json(walled.as_json()) == walled
+    assert ObstacleMap.from_json(scene.as_json()) == scene
+    walled = ObstacleMap(polygons=(((0.0, 1.0), (2.0, 3.0), (4.0, 5.0)),), goal_m=(1.0, 2.0))
+    assert ObstacleMap.from_json(walled.as_json()) == walled

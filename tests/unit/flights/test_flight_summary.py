@@ -8,7 +8,7 @@ from typing import Any
 
 from morpheyes_daemon.bus import EventLog, Topics
 from morpheyes_daemon.cli.sim import _page
-from morpheyes_daemon.flights.lockstep import Summary, Tally
+from morpheyes_daemon.flights.lockstep import FlightCounter, Summary
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 
@@ -25,7 +25,7 @@ def summary(**changes: Any) -> Summary:
 
 def test_what_was_last_said_of_a_reason_is_kept_but_not_the_monitor_s_own_words() -> None:
     events = EventLog()
-    tally = Tally(Topics.create(), events)
+    tally = FlightCounter(Topics.create(), events)
     for source, reason, text in (
         ("camera", Reason.CAMERA_LOST, "camera: unplugged"),
         ("camera", Reason.RECOVERED, "camera: works again"),

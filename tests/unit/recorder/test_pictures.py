@@ -19,7 +19,7 @@ from morpheyes_daemon.messages.safety import Action, GateOutput, State
 from morpheyes_daemon.recorder.pictures.film import FlightFilm
 from morpheyes_daemon.recorder.pictures.map import DPI, LEFT_IN, RIGHT_IN, WIDTH_IN, draw_map
 from morpheyes_daemon.recorder.pictures.outline import Track, clearances, closest_passes
-from morpheyes_daemon.recorder.pictures.scene import Disc, Scene
+from morpheyes_daemon.recorder.pictures.scene import Disc, ObstacleMap
 from morpheyes_daemon.recorder.pictures.strips import draw_strips
 from morpheyes_daemon.recorder.pictures.topview import TREE, Pose, TopView
 from morpheyes_daemon.recorder.reader import read_flight
@@ -54,7 +54,7 @@ def share_of(picture: Any, bgr: tuple[int, int, int], tolerance: int = 6) -> flo
 
 @pytest.mark.parametrize(("baseline_m", "other_m"), [(0.1, 0.3), (0.3, 0.1), (0.2, 0.1)])
 def test_path_has_the_colour_of_its_baseline(tmp_path: Path, baseline_m: float, other_m: float) -> None:
-    draw_map(tmp_path / "map.png", straight_flight(baseline_m), Scene(), Footprint())
+    draw_map(tmp_path / "map.png", straight_flight(baseline_m), ObstacleMap(), Footprint())
     picture = cv2.imread(str(tmp_path / "map.png"))
     above_the_colour_bar = picture[: picture.shape[0] * 6 // 10]
     assert share_of(above_the_colour_bar, baseline_bgr(baseline_m)) > 1e-3
@@ -64,7 +64,7 @@ def test_path_has_the_colour_of_its_baseline(tmp_path: Path, baseline_m: float, 
 def test_trunks_are_drawn_to_scale(tmp_path: Path) -> None:
     """Filled area against pi r^2; 8 % for the drawn edge, which is another colour, and anti-aliasing."""
     series, disc = straight_flight(0.2), Disc(20.0, 3.0, 1.5)
-    draw_map(tmp_path / "with.png", series, Scene((disc,)), Footprint())
+    draw_map(tmp_path / "with.png", series, ObstacleMap((disc,)), Footprint())
     picture = cv2.imread(str(tmp_path / "with.png"))
     map_part = picture[: round(0.6 * picture.shape[0])]
     pixels = share_of(map_part, (0x5F, 0x78, 0x66)) * map_part.shape[0] * map_part.shape[1]
@@ -73,15 +73,15 @@ def test_trunks_are_drawn_to_scale(tmp_path: Path) -> None:
 
 
 def test_map_of_nothing_is_still_a_picture(tmp_path: Path) -> None:
-    draw_map(tmp_path / "empty.png", FlightSeries(), Scene(), Footprint())
+    draw_map(tmp_path / "empty.png", FlightSeries(), ObstacleMap(), Footprint())
     draw_map(tmp_path / "scene.png", FlightSeries(), forest_scene(), Footprint(), collided=True)
     assert cv2.imread(str(tmp_path / "scene.png")) is not None
 
 
 def test_walls_and_close_ups_are_drawn(tmp_path: Path) -> None:
     wall = (((8.0, -3.0), (8.3, -3.0), (8.3, -0.6), (8.0, -0.6)),)
-    draw_map(tmp_path / "a.png", straight_flight(0.2), Scene((Disc(20.0, 0.7, 0.3),), wall), Footprint())
-    draw_map(tmp_path / "b.png", straight_flight(0.2), Scene(polygons=wall), Footprint())
+    draw_map(tmp_path / "a.png", straight_flight(0.2), ObstacleMap((Disc(20.0, 0.7, 0.3),), wall), Footprint())
+    draw_map(tmp_path / "b.png", straight_flight(0.2), ObstacleMap(polygons=wall), Footprint())
     a, b = cv2.imread(str(tmp_path / "a.png")), cv2.imread(str(tmp_path / "b.png"))
     assert a.shape[0] > b.shape[0]  # the row of close-ups
     assert share_of(b, (139, 154, 167)) > 1e-4
@@ -90,18 +90,18 @@ def test_walls_and_close_ups_are_drawn(tmp_path: Path) -> None:
 def test_clearance_is_from_the_outline_to_the_trunk() -> None:
     track = Track.of(straight_flight(0.3))
     footprint = Footprint()
-    beside = Scene((Disc(20.0, 1.0, 0.2),))
+    beside = ObstacleMap((Disc(20.0, 1.0, 0.2),))
     assert clearances(track, beside, footprint).min() == pytest.approx(1.0 - 0.2 - 0.337 / 2, abs=1e-9)
-    ahead = Scene((Disc(45.0, 0.0, 0.2),))
+    ahead = ObstacleMap((Disc(45.0, 0.0, 0.2),))
     assert clearances(track, ahead, footprint).min() == pytest.approx(5.0 - 0.2 - 0.337 / 2, abs=1e-9)
     wide = Footprint(hull_width_mm=200.0)
-    beside_the_bar = Scene((Disc(20.09, 1.0, 0.2),))
+    beside_the_bar = ObstacleMap((Disc(20.09, 1.0, 0.2),))
     assert clearances(track, beside_the_bar, wide).min() == pytest.approx(1.0 - 0.2 - 0.33 / 2, abs=1e-9)
 
 
 def test_closest_passes_are_near_and_apart() -> None:
     track = Track.of(straight_flight(0.2))
-    scene = Scene((Disc(5.0, 0.6, 0.1), Disc(5.4, 0.7, 0.1), Disc(20.0, 0.8, 0.1), Disc(30.0, 3.0, 0.1)))
+    scene = ObstacleMap((Disc(5.0, 0.6, 0.1), Disc(5.4, 0.7, 0.1), Disc(20.0, 0.8, 0.1), Disc(30.0, 3.0, 0.1)))
     passes = closest_passes(track, clearances(track, scene, Footprint()), 9)
     assert [round(float(track.xy_m[i, 0])) for i in passes] == [5, 20]
 
@@ -144,7 +144,7 @@ def test_view_from_above_has_north_up_and_east_right() -> None:
         (Disc(14.0, 5.0, 0.5), (slice(0, 180), slice(200, 280))),
         (Disc(10.0, 9.0, 0.5), (slice(200, 330), slice(350, 450))),
     ):
-        picture = TopView(Scene((disc,)), Footprint()).draw(pose)
+        picture = TopView(ObstacleMap((disc,)), Footprint()).draw(pose)
         green = np.abs(picture.astype(int) - np.array(TREE)).max(axis=2) <= 6
         assert green[inside].sum() > 0.9 * green.sum() > 0
 
@@ -176,7 +176,7 @@ def test_film_can_be_made_from_a_log(tmp_path: Path) -> None:
 
 
 def test_film_without_a_single_image_is_closed_without_error(tmp_path: Path) -> None:
-    FlightFilm(tmp_path / "none.mp4", Scene(), Footprint()).close()
+    FlightFilm(tmp_path / "none.mp4", ObstacleMap(), Footprint()).close()
 
 
 FULL_DISK = """

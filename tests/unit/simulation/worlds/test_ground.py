@@ -13,9 +13,9 @@ from morpheyes_daemon.simulation.autopilot.flight_modes import FlightSettings, M
 from morpheyes_daemon.simulation.autopilot.mode_controllers import FlightControl
 from morpheyes_daemon.simulation.autopilot.parameters import ParameterTable
 from morpheyes_daemon.simulation.autopilot.rc_input import PilotInput
-from morpheyes_daemon.simulation.worlds.ground import LEVEL, Ground, Relief, lay
+from morpheyes_daemon.simulation.worlds.ground import LEVEL, Ground, GroundShape, lay
 
-UPHILL = lay(Relief(slope_deg=10.0), seed=0)
+UPHILL = lay(GroundShape(slope_deg=10.0), seed=0)
 
 
 def test_ground_starts_at_zero_and_rises_by_its_slope() -> None:
@@ -25,7 +25,7 @@ def test_ground_starts_at_zero_and_rises_by_its_slope() -> None:
 
 
 def test_waves_stay_within_their_height_and_differ_by_seed() -> None:
-    one, other = (lay(Relief(rolling_m=0.8), seed) for seed in (1, 2))
+    one, other = (lay(GroundShape(rolling_m=0.8), seed) for seed in (1, 2))
     heights = [one.height_m(x, y) for x in range(0, 100, 3) for y in range(-40, 40, 3)]
     assert one.height_m(0.0, 0.0) == 0.0
     # measured from the start, which may lie at the bottom or on the top of a wave
