@@ -1,7 +1,7 @@
 """What a row of the fault matrix is, how a fault may end, and the rule for each ending. The rows are in `faults`.
 
 Class A: the daemon lives and must act within 250 ms of noticing. Class B: it is dead or cut off, the autopilot's own
-time-out actions, and the vehicle must stop within what the governor had kept free.
+time-out acts, and the vehicle must stop within what the governor had kept free.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class FaultOutcome(StrEnum):
     FLIES = "flies on"
     FLIES_WITH_PAUSES = "flies on, neutral whenever too much is missing"
     RESUMES = "neutral, then flies on"
-    HOLDS = "neutral until the pilot actions"
-    HOLDS_IF_IT_MATTERS = "flies on, or neutral until the pilot actions"
+    HOLDS = "neutral until the pilot acts"
+    HOLDS_IF_IT_MATTERS = "flies on, or neutral until the pilot acts"
     RELEASES = "released at once"
     LETS_GO = "neutral, then released"
     READY = "stays ready, sends nothing"

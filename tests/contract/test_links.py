@@ -16,7 +16,7 @@ from morpheyes_daemon.clock import run_virtual
 from morpheyes_daemon.devices.link import WRITE_LIMIT_BYTES, Link, MemoryLink, open_link
 from morpheyes_daemon.errors import ConfigError, DeviceNotFoundError
 
-DaemonMirror = asyncio.Queue[bytes]
+Received = asyncio.Queue[bytes]
 
 
 @dataclass
