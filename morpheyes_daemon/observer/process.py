@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import os
 import signal
 import socket
@@ -83,6 +84,7 @@ def observe(job: ObserverJob, channel: socket.socket) -> None:
     """Run until the other end is closed; the entry point of the process."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the flight process decides when it is over
+    logging.disable()  # aiohttp would write a traceback for every request that is none
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
     asyncio.run(_observe(job, channel))
