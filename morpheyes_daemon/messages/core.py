@@ -249,7 +249,7 @@ class MissionCommand:
     """Velocity, heading and baseline that the mission wants; worthless after `expires_ns`.
 
     `clear_m` is how far the swept corridor along `v_ned_m_s` is known to be free, measured from where the vehicle
-    was at `measured_ns`; the governor never lets the vehicle outrun it. `margin_m` has been taken off already.
+    was at `p_measured_ned_m`; the governor never lets the vehicle outrun it. `margin_m` has been taken off already.
     `coast` asks for neutral pitch and roll (the last stretch through a gap). `line` is kept to at every stick period,
     in height too when `height_m` is None. `detail` is for log and plots, `text` says more about the reason.
     """
@@ -264,7 +264,6 @@ class MissionCommand:
     height_m: float | None
     baseline_m: float
     clear_m: float
-    measured_ns: int
     p_measured_ned_m: tuple[float, float, float]
     z_close_m: float = math.nan
     coast: bool = False

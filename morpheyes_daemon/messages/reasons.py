@@ -1,7 +1,7 @@
 """Why the vehicle braked, was released, was refused or stopped: one code, the same everywhere.
 
 The code appears in the log, STATUSTEXT, NAMED_VALUE_INT (its number), systemd STATUS and on the dashboard.
-Numbers are never used twice, since they stand in old DataFlash logs.
+Numbers are never used twice, since they stand in old DataFlash logs; 60 and 62 are retired.
 """
 
 from enum import StrEnum
@@ -53,9 +53,7 @@ class Reason(StrEnum):
     PARAMETERS_UNKNOWN = "parameters_unknown", 49, "the autopilot's parameters have not been read yet"
 
     # what the mission and governor brake for
-    OBSTACLE_CLOSE = "obstacle_close", 60, "an obstacle is nearer than the safe braking distance"
     NO_FREE_PATH = "no_free_path", 61, "no free direction is in sight"
-    BLIND = "blind", 62, "too few pixels have a depth"
     IMAGE_BAD = "image_bad", 63, "the images are frozen, dark, swapped or do not match"
     DEPTH_SCALE = "depth_scale", 65, "depth does not fit the motion: the eyes are not where the servo should hold them"
     EYES_APART = "eyes_apart", 66, "the eyes' rows stay apart: not exposed together, bent, or another rig's calibration"

@@ -54,7 +54,6 @@ class CommandBuilder:
             height_m=decision.height_m,
             baseline_m=decision.baseline_m,
             clear_m=decision.clear_m,
-            measured_ns=observation.vehicle.position_t_ns,
             p_measured_ned_m=observation.vehicle.p_ned_m,
             z_close_m=decision.z_close_m,
             detail=decision.detail,

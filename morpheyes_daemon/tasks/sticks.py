@@ -11,14 +11,10 @@ from morpheyes_daemon.control.stick_controller import StickController
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.messages.safety import State
-from morpheyes_daemon.safety.gate import Gate
+from morpheyes_daemon.safety.gate import LATE_NS, Gate
 from morpheyes_daemon.safety.leases import Lease
 from morpheyes_daemon.safety.monitor import SafetyMonitor
 from morpheyes_daemon.supervisor.supervisor import Pulse
-
-LATE_NS = 100 * MS
-"""A stick period held up for longer than this was not flown on purpose: neutral first, then go on. Chosen: five
-periods at 50 Hz; shorter would brake for a hold-up of a busy small computer."""
 
 
 @dataclass(slots=True)

@@ -64,7 +64,6 @@ class Weaver(Strategy):
             None,
             self.parameters.gain * clear_m,
             clear_m,
-            observation.summary.t_ns,
             observation.at_exposure.p_ned_m,
             clear_m,
             detail={"sum": self._sum},

@@ -105,7 +105,7 @@ class SyntheticFlight:
         yaw_us = round(1500 + 120 * math.sin(s * 1.3))
         self.topics.sticks.publish(Sticks(t, t + S // 5, 1500, pitch, 1500, yaw_us))
         state = State.BRAKING if braking else State.ENGAGED
-        reason = Reason.OBSTACLE_CLOSE if braking else Reason.ENGAGED
+        reason = Reason.NO_FREE_PATH if braking else Reason.ENGAGED
         action = Action.NEUTRAL if braking else Action.STICKS
         self.topics.gate.publish(GateOutput(t, state, action, reason, 1500, pitch, 1500, yaw_us))
 
@@ -124,13 +124,12 @@ class SyntheticFlight:
                 t,
                 t + S // 2,
                 intent,
-                Reason.OBSTACLE_CLOSE if braking else None,
+                Reason.NO_FREE_PATH if braking else None,
                 (3.0, 0.0, 0.0),
                 0.0,
                 1.5,
                 wanted,
                 z_close,
-                t - S // 10,
                 (self.x_m, 0.0, -1.5),
                 z_close,
             )

@@ -26,7 +26,7 @@ SEEN = DepthSummary(1, 0, 0, 0.2, 0.0005, 370.0, 0.8, 0.25, 0.9, 0.9, 0.0, 2.0, 
 
 def command(clear_m: float, speed: float = 4.0) -> MissionCommand:
     return MissionCommand(
-        1, 0, 10**9, Intent.FLY, None, (speed, 0.0, 0.0), 0.0, 1.5, 0.2, clear_m, 0, (0.0, 0.0, -1.5), clear_m
+        1, 0, 10**9, Intent.FLY, None, (speed, 0.0, 0.0), 0.0, 1.5, 0.2, clear_m, (0.0, 0.0, -1.5), clear_m
     )
 
 

@@ -44,7 +44,7 @@ SEEN = DepthSummary(1, 0, 0, 0.2, 0.0, 500.0, 0.8, 0.1, 0.9, 0.9, 0.0, 2.0, 0.02
 def command(clear_m: float, v: tuple[float, float] = (4.0, 0.0), z_close_m: float = math.nan) -> MissionCommand:
     return MissionCommand(
         seq=1, t_ns=0, expires_ns=10**9, intent=Intent.FLY, reason=None, v_ned_m_s=(*v, 0.0), yaw_rad=0.0,
-        height_m=1.5, baseline_m=0.2, clear_m=clear_m, measured_ns=0, p_measured_ned_m=(10.0, 20.0, -1.5),
+        height_m=1.5, baseline_m=0.2, clear_m=clear_m, p_measured_ned_m=(10.0, 20.0, -1.5),
         z_close_m=z_close_m,
     )  # fmt: skip
 

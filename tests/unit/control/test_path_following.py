@@ -20,7 +20,7 @@ S = 1_000_000_000
 def command(line, v=(3.0, 0.0, 0.0)):
     return MissionCommand(
         seq=1, t_ns=0, expires_ns=S, intent=Intent.FLY, reason=None, v_ned_m_s=v, yaw_rad=0.0, height_m=None,
-        baseline_m=0.1, clear_m=5.0, measured_ns=0, p_measured_ned_m=(0.0, 0.0, 0.0), line=line,
+        baseline_m=0.1, clear_m=5.0, p_measured_ned_m=(0.0, 0.0, 0.0), line=line,
     )  # fmt: skip
 
 

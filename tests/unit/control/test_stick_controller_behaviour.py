@@ -90,7 +90,7 @@ class Flight:
                     seq=1, t_ns=now_ns, expires_ns=now_ns + S, intent=Intent.FLY, reason=None, v_ned_m_s=v,
                     yaw_rad=None, height_m=None, baseline_m=0.2,
                     clear_m=min(30.0, self.wall_m - self.along(self.plant.p)),
-                    measured_ns=now_ns, p_measured_ned_m=state.p_ned_m,
+                    p_measured_ned_m=state.p_ned_m,
                 )  # fmt: skip
             if ms % 20 == 0 and ms < dies_s * 1000:
                 self.told.append(stepped(self.controller, order, self.seen, state, now_ns))
@@ -172,7 +172,7 @@ STEADY = VehicleState(
 def order(**changes: object) -> MissionCommand:
     base = MissionCommand(
         seq=1, t_ns=9 * S, expires_ns=10 * S, intent=Intent.FLY, reason=None, v_ned_m_s=(2.0, 0.0, 0.0), yaw_rad=None,
-        height_m=None, baseline_m=0.2, clear_m=30.0, measured_ns=9 * S, p_measured_ned_m=(0.0, 0.0, -1.5),
+        height_m=None, baseline_m=0.2, clear_m=30.0, p_measured_ned_m=(0.0, 0.0, -1.5),
     )  # fmt: skip
     return replace(base, **changes)  # type: ignore[arg-type]
 

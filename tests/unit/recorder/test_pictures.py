@@ -111,7 +111,7 @@ def test_brakings_and_stops_are_told_apart_and_the_end_is_neither() -> None:
     t = series.start_ns + 30 * S
     series.add("gate", GateOutput(t, State.BRAKING, Action.NEUTRAL, Reason.GOAL_REACHED))
     for found in (series.braking(), series.stops()):
-        assert [reason for _, reason in found] == ["obstacle_close"]
+        assert [reason for _, reason in found] == ["no_free_path"]
         assert found[0][0] == pytest.approx(14.2, abs=0.2)  # five decisions a second
 
 

@@ -49,7 +49,6 @@ def wanting(baseline_m: float, t_ns: int) -> MissionCommand:
         height_m=None,
         baseline_m=baseline_m,
         clear_m=0.0,
-        measured_ns=t_ns,
         p_measured_ned_m=(0.0, 0.0, 0.0),
     )
 
