@@ -3,6 +3,7 @@
 The command line prints the message alone and exits with `exit_code`.
 """
 
+import re
 import sysconfig
 import traceback
 from pathlib import Path
@@ -56,6 +57,17 @@ class DeviceLostError(DeviceError):
 
 class DeviceTimeoutError(DeviceError):
     """The device is there but does not answer in time."""
+
+
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def printable(text: str) -> str:
+    """Return text from a file or a link as a terminal may show it: control characters are written out.
+
+    An escape sequence could clear the screen, rename the window, or show another text than stands there.
+    """
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text).replace("\n", "\\n")
 
 
 def mistake(error: BaseException) -> str:

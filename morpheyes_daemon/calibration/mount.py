@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from morpheyes_daemon.calibration.solver.initial_guess import board_pose
@@ -22,6 +21,7 @@ from morpheyes_daemon.calibration.targets.boards import Board, find_corners
 from morpheyes_daemon.errors import CalibrationError, InputError
 from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.progress import Progress, silent
+from morpheyes_daemon.stereo.image_files import read_picture
 from morpheyes_daemon.stereo.intrinsics import CameraIntrinsics
 from morpheyes_daemon.stereo.rig import CameraMount
 from morpheyes_daemon.transforms import Array, R_from_rotvec, R_from_rpy, rotvec_from_R
@@ -110,10 +110,12 @@ def read_mount_folder(folder: Path, board: Board, cam0: CameraIntrinsics, progre
     names, attitudes, boards, problems = [], [], [], []
     rows = list(attitude_rows(folder / ATTITUDES))
     for done, (name, attitude) in enumerate(rows, start=1):
-        image = cv2.imread(str(folder / name), cv2.IMREAD_COLOR)
-        if image is None:
-            problems.append(f"{folder / name}: is not a readable picture; copy it again or delete its row.")
-        elif (seen := board_rotation(np.asarray(image, np.uint8), board, cam0)) is None:
+        try:
+            image = read_picture(folder / name)
+        except InputError as error:
+            problems.append(f"{error} Copy it again or delete its row.")
+            continue
+        if (seen := board_rotation(image, board, cam0)) is None:
             problems.append(f"{folder / name}: shows no complete board and is left out.")
         else:
             names.append(name)

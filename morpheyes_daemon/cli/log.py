@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from morpheyes_daemon.errors import printable
+
 if TYPE_CHECKING:
     from morpheyes_daemon.recorder.reader import Flight
 
@@ -49,8 +51,8 @@ def _content(flight: Flight) -> dict[str, Any]:
 
 def _page(content: dict[str, Any]) -> str:
     shown = {key: value for key, value in content.items() if key not in ("topics", "config")}
-    lines = [f"{key:17} {value}" for key, value in shown.items() if value != ""]
-    lines += [f"  {count:8d}  {topic}" for topic, count in content["topics"].items()]
+    lines = [printable(f"{key:17} {value}") for key, value in shown.items() if value != ""]
+    lines += [printable(f"  {count:8d}  {topic}") for topic, count in content["topics"].items()]
     if not content["finished"]:
         lines.append(f"The log is truncated; `morpheyes log recover {content['file']}` writes a complete one.")
     return "\n".join(lines)
@@ -71,7 +73,7 @@ def events(file: LogFile, as_json: AsJson = False) -> None:
         typer.echo(json.dumps(rows, indent=2))
     else:
         for row, event in zip(rows, flight.events, strict=True):
-            typer.echo(f"{row['t_s']:9.3f}  {event.source:12} {event.reason.text}{_more(event.text)}")
+            typer.echo(printable(f"{row['t_s']:9.3f}  {event.source:12} {event.reason.text}{_more(event.text)}"))
 
 
 def _more(text: str) -> str:

@@ -23,7 +23,7 @@ from morpheyes_daemon.bus import EventLog, Latest, Topics
 from morpheyes_daemon.clock import MonotonicClock, S
 from morpheyes_daemon.config.vehicle import DashboardConfig
 from morpheyes_daemon.dashboard.server import Dashboard
-from morpheyes_daemon.errors import DeviceError, InputError, RecordingError
+from morpheyes_daemon.errors import DeviceError, InputError, RecordingError, printable
 from morpheyes_daemon.messages.core import Event
 from morpheyes_daemon.messages.reasons import Reason
 from morpheyes_daemon.observer.channel import RecordReader
@@ -206,11 +206,6 @@ class Journal:
     def _write(self, text: str) -> None:
         with contextlib.suppress(OSError):
             os.write(self._number, (printable(text) + "\n").encode(errors="replace"))
-
-
-def printable(text: str) -> str:
-    """Return the text without control characters, which a terminal would obey."""
-    return "".join(character if character.isprintable() else " " for character in text)
 
 
 def event_line(event: Event, began_ns: int) -> str:

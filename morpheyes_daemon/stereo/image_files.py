@@ -8,11 +8,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from morpheyes_daemon import LARGEST_PICTURE_PX
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import FloatMap, Image
 from morpheyes_daemon.stereo.colours import UNKNOWN_BGR, colour_depth
 from morpheyes_daemon.stereo.still import StillDepth, halves
 
+LARGEST_FILE_BYTES = 300_000_000
+"""Bytes; chosen: no compression makes LARGEST_PICTURE_PX larger than this."""
 NEAR_BGR, HALF_OCCLUDED_BGR = (235, 235, 235), (96, 84, 78)
 INK, GREY = "#30343a", "#888888"
 WIDTH_IN, DPI = 9.0, 150
@@ -29,16 +32,31 @@ def read_pair(left: Path, right: Path | None) -> tuple[Image, Image]:
     return read_picture(left), read_picture(right)
 
 
-def read_picture(path: Path) -> Image:
-    """Return a picture as BGR (H, W, 3) uint8; raises InputError naming the file."""
+def read_picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> Image:
+    """Return a picture as BGR (H, W, 3) uint8, or as OpenCV's `flags` say; raises InputError naming the file."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such file.")
     try:
-        picture = cv2.imdecode(np.fromfile(path, dtype=np.uint8), cv2.IMREAD_COLOR)
-    except (cv2.error, OSError):
+        if path.stat().st_size > LARGEST_FILE_BYTES:
+            raise InputError(f"{path}: is larger than {LARGEST_FILE_BYTES // 1_000_000} MB; make it smaller.")
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+    return decode_picture(content, str(path), flags)
+
+
+def decode_picture(content: bytes, name: str, flags: int = cv2.IMREAD_COLOR) -> Image:
+    """Return the picture in a file's content; raises InputError, also for one of more pixels than are ever read."""
+    try:
+        picture = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags) if content else None
+    except cv2.error as error:
+        if "CV_IO_MAX_IMAGE" in str(error):
+            raise InputError(
+                f"{name}: has more than {LARGEST_PICTURE_PX // 1_000_000} million pixels; make it smaller."
+            ) from None
         picture = None
     if picture is None:
-        raise InputError(f"{path}: cannot be read as a picture; PNG, JPEG, PPM and the like can.")
+        raise InputError(f"{name}: cannot be read as a picture; PNG, JPEG, PPM and the like can.")
     return np.asarray(picture, dtype=np.uint8)
 
 

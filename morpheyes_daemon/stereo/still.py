@@ -19,6 +19,9 @@ from morpheyes_daemon.stereo.rig import RigModel
 SEARCHED_SHARE = 0.25
 """Share of the image width that is searched without `near_m`; chosen: more finds nearer objects and takes longer."""
 
+SMALLEST_PX = 32, 16
+"""Width and height of the smallest picture; chosen: a few of the matcher's blocks."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StillDepth:
@@ -59,6 +62,7 @@ def rectified_depth(
     when the sizes differ or `near_m` needs more disparities than the images are wide.
     """
     require_same_size(left, right)
+    _require_matchable(left, doffs_px)
     width = left.shape[1]
     low = math.floor(-doffs_px)
     if near_m is None:
@@ -87,6 +91,7 @@ def raw_depth(
     CalibrationError when the rig does not fit the pictures or the baseline.
     """
     require_same_size(left, right)
+    _require_matchable(left, 0.0)
     if baseline_m is None:
         low, high = rig.range_m
         if low != high:
@@ -102,6 +107,17 @@ def raw_depth(
     shown = pair.rectification.cam0.image(left)
     limit, f_px = depth.near_limit_m, depth.pinhole.f_px
     return StillDepth(shown, depth.depth_m, depth.near, depth.half_occluded, limit, depth.baseline_m, f_px)
+
+
+def _require_matchable(left: Image, doffs_px: float) -> None:
+    height, width = left.shape[:2]
+    if width < SMALLEST_PX[0] or height < SMALLEST_PX[1]:
+        raise InputError(
+            f"Pictures of {width}x{height} px show nothing to match; "
+            f"give pictures of {SMALLEST_PX[0]}x{SMALLEST_PX[1]} px at least."
+        )
+    if not abs(doffs_px) < width:
+        raise InputError(f"An offset of {doffs_px:g} px between the principal points is no offset of a camera.")
 
 
 def halves(picture: Image) -> tuple[Image, Image]:

@@ -138,7 +138,7 @@ def test_a_damaged_picture_is_named_and_passed_over(tmp_path: Path) -> None:
         camera = RecordingCamera(recorded(tmp_path), running_clock())
         await camera.open()
         await camera.read()
-        with pytest.raises(InputError, match=r"2\.png: cannot be read as an image"):
+        with pytest.raises(InputError, match=r"2\.png: cannot be read as a picture"):
             await camera.read()
         assert values([await camera.read()]) == [(30, 10)]
 

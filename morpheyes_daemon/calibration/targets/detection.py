@@ -24,6 +24,7 @@ from morpheyes_daemon.calibration.targets.observations import Observations
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import Image
 from morpheyes_daemon.progress import Progress, silent
+from morpheyes_daemon.stereo.image_files import decode_picture
 from morpheyes_daemon.transforms import Array
 
 _FEWEST_VIEWS = 3
@@ -137,10 +138,10 @@ def _corners_in(
         stored = cache.found[key]
         size = (int(stored[-1, 0]), int(stored[-1, 1]))
         return (stored[:-1] if len(stored) > 1 else None), size, None
-    image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if content else None
-    if image is None:
-        return None, (0, 0), f"{path}: is not a readable picture; copy it again or remove it."
-    picture = _half(np.asarray(image, dtype=np.uint8), half)
+    try:
+        picture = _half(decode_picture(content, str(path), cv2.IMREAD_GRAYSCALE), half)
+    except InputError as error:
+        return None, (0, 0), f"{error} Copy it again or remove it."
     size = (picture.shape[1], picture.shape[0])
     corners = find_corners(picture, board)
     cache.found[key] = np.vstack([np.empty((0, 2)) if corners is None else corners, [size]])

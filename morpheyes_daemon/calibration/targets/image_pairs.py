@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from morpheyes_daemon.errors import InputError
 from morpheyes_daemon.messages.core import Image
+from morpheyes_daemon.stereo.image_files import read_picture
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 _SIDE_BY_SIDE_ASPECT = 1.9
@@ -70,10 +70,9 @@ def read_pair(files: PairFiles) -> tuple[Image, Image]:
     """Return both images (H, W, 3) BGR of a pair; raises InputError naming the file that cannot be read."""
     pictures = []
     for path in (files.left, files.right):
-        image = None if path is None else cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if image is None:
-            raise InputError(f"{path}: is not a readable picture; copy it again or remove it.")
-        pictures.append(np.asarray(image, dtype=np.uint8))
+        if path is None:
+            raise InputError(f"{files.left or files.right}: the other camera's picture is missing; copy or remove it.")
+        pictures.append(read_picture(path))
     if not files.side_by_side:
         return pictures[0], pictures[1]
     middle = pictures[0].shape[1] // 2
@@ -134,7 +133,10 @@ def _left_right(files: list[Path], problems: list[str]) -> list[PairFiles]:
 def _side_by_side(files: list[Path]) -> list[PairFiles]:
     pairs = []
     for path in files:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if image is not None and image.shape[1] >= _SIDE_BY_SIDE_ASPECT * image.shape[0]:
+        try:
+            height, width = read_picture(path, cv2.IMREAD_GRAYSCALE).shape
+        except InputError:
+            continue
+        if width >= _SIDE_BY_SIDE_ASPECT * height:
             pairs.append(PairFiles(path, path))
     return pairs

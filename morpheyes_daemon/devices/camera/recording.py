@@ -20,6 +20,7 @@ from morpheyes_daemon.config.vehicle import RecordingCameraConfig
 from morpheyes_daemon.devices.family import DeviceContext
 from morpheyes_daemon.errors import DeviceLostError, InputError
 from morpheyes_daemon.messages.core import Image, RawPair, frozen
+from morpheyes_daemon.stereo.image_files import read_picture
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".pnm"}
 _SIDE = re.compile(r"(left|right)[-_ ]?(.*)", re.IGNORECASE)
@@ -202,11 +203,7 @@ class Video:
 
 def read_image(path: Path) -> Image:
     """Read an image as grey (H, W) or BGR (H, W, 3), 8 bit; InputError when it cannot be."""
-    data = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR) if data.size else None
-    if image is None:
-        raise InputError(f"{path}: cannot be read as an image; is it damaged?")
-    return np.asarray(image, dtype=np.uint8)
+    return read_picture(path, cv2.IMREAD_ANYCOLOR)
 
 
 def halves(image: Image, name: str) -> Pair:

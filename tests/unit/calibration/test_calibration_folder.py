@@ -122,7 +122,7 @@ def test_unreadable_and_empty_pictures_are_named(tmp_path: Path) -> None:
     folders, problems = read_folder(tmp_path)
     assert observe(folders, BOARD, problems=problems).view_count == 3
     for name in ("left02.png", "right03.png"):
-        assert any(name in problem and "not a readable picture" in problem for problem in problems)
+        assert any(name in problem and "cannot be read as a picture" in problem for problem in problems)
 
 
 def test_pictures_without_a_board_are_named_and_a_baseline_without_any_is_lost(tmp_path: Path) -> None:

@@ -121,7 +121,9 @@ def test_pictures_that_cannot_be_used_are_named_and_left_out(folder: Path, tmp_p
     (tmp_path / "left03.png").write_bytes(b"no picture")
     (tmp_path / ATTITUDES).write_text("\n".join(lines[:4]) + "\nleft99.png,0,0,0\n")
     views = read_mount_folder(tmp_path, BOARD, RigTwin(640, 480, seed=1).cam0)
-    assert [problem.partition(":")[0].rpartition("/")[2] for problem in views.problems if "readable" in problem] == [
+    assert [
+        problem.partition(":")[0].rpartition("/")[2] for problem in views.problems if "delete its row" in problem
+    ] == [
         "left03.png",
         "left99.png",
     ]
